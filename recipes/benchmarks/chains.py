@@ -64,9 +64,9 @@ class Chain:
     delay: float = 0.0
 
     @classmethod
-    def draw(cls, rng: np.random.Generator, servos: bool) -> Chain:
+    def draw(cls, rng: np.random.Generator, servos: bool, sizes: tuple[int, int] = SIZES) -> Chain:
         """Draw a chain; its losses and drives have the size of the inertias and weights that they move."""
-        count = int(rng.integers(SIZES[0], SIZES[1] + 1))
+        count = int(rng.integers(sizes[0], sizes[1] + 1))
         thinner, shorter = rng.uniform(0.8, 0.95), rng.uniform(0.85, 0.95)
         masses = rng.uniform(1.5, 4.0) * thinner ** np.arange(count) * rng.uniform(0.8, 1.2, count)
         lengths = rng.uniform(0.15, 0.3) * shorter ** np.arange(count)

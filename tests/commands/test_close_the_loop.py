@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import shlex
 import subprocess
 import sys
 import time
@@ -337,6 +338,29 @@ def test_a_full_disk_does_not_lose_the_result(robot, monkeypatch, capsys):
     assert line.startswith("OSError: ")
     assert "File too large" in line
     assert {path: path.read_bytes() for path in (robot / "out").iterdir()} == before
+
+
+@pytest.mark.slow
+def test_the_next_and_the_first_experiment_are_designed(robot):
+    log = ["simulator=robot.xml", "data=log.csv", "columns=log.yaml", "simulator.coordinates={angle: pivot}"]
+    report(JointDamping(0.1, "pivot")).save(robot / "found")
+    done = command(robot, *log, "next=found/report.json", "minutes=0.02", "seconds=2", "hydra.run.dir=out")
+    assert done.returncode == 0, done.stdout
+    assert "One explanation is left. The experiment narrows its intervals" in done.stdout
+    (then,) = [line for line in done.stdout.splitlines() if line.startswith("then")]
+    _, _, *again = shlex.split(then)
+    assert again[-1] == "data=[NEW_LOG,log.csv]"
+    assert {"simulator.path=robot.xml", "columns=log.yaml", "simulator.coordinates={angle: pivot}"} <= {*again}
+    assert (robot / "out" / "commands.csv").read_text().startswith("time (s),motor")
+
+    refused = command(robot, "plan=robot.xml")
+    assert "actuators without a range of commands: motor; give each a ctrlrange in the model" in refused.stdout
+    (robot / "limited.xml").write_text(PENDULUM.replace('joint="pivot"/>', 'joint="pivot" ctrlrange="-1 1"/>'))
+    faster = "simulator.control_step=0.005"
+    done = command(robot, "plan=limited.xml", faster, "minutes=0.02", "seconds=2", "hydra.run.dir=first")
+    assert len((robot / "first" / "commands.csv").read_text().splitlines()) == 1 + 400
+    assert "2 s of these commands would show, from known states and from this size on:" in done.stdout, done.stdout
+    assert "look at    first/experiment.html" in done.stdout
 
 
 @pytest.mark.slow

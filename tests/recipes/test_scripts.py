@@ -73,6 +73,14 @@ def test_the_tutorial_on_simulators_finds_the_hidden_effect(tmp_path):
     assert (tmp_path / "out" / "log.csv").exists()
 
 
+def test_the_tutorial_on_experiments_decides_between_a_payload_and_a_weak_motor(tmp_path):
+    printed = run("tutorials/what_to_record_next.py", tmp_path, "out")
+    first, both = (re.search(f"{logs}: (.*)", printed)[1] for logs in ("the first log", "both logs"))
+    assert "shoulder_motor × 0.87" in first
+    assert float(re.search(r"payload of (\S+) kg .* on bodies lower", both)[1]) == pytest.approx(0.15, rel=0.1)
+    assert (tmp_path / "out" / "commands.csv").exists()
+
+
 def test_the_main_job_needs_no_package_of_the_extra_comparison():
     blocked = "import sys; sys.modules.update(dict.fromkeys(['pandas', 'rliable', 'arch'])); import h2o_plus"
     done = subprocess.run([sys.executable, "-c", blocked], cwd=ROOT / "recipes", capture_output=True, text=True)

@@ -5,18 +5,23 @@ close-the-loop data=standing_still.txt                   # the same simulator wi
 close-the-loop simulator=HalfCheetah-v5 simulator.gap=gravity data=halfcheetah/medium-replay-v0
 close-the-loop simulator=robot.xml data=log.csv columns=log.yaml       # your own model and log
 close-the-loop simulator=a.xml data=b.xml                # what one simulator lacks compared with another one
+close-the-loop next=outputs/close_the_loop/... simulator=robot.xml data=log.csv columns=log.yaml  # what to record next
+close-the-loop plan=robot.xml seconds=20                 # what to record first, and what it would show
 close-the-loop --guess data=log.csv simulator=robot.xml                # writes a first log.yaml for you to correct
 """
 
 import os
 import re
+import shlex
 import sys
 import time
 from contextlib import suppress
 from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import Any
 
+import mujoco
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig
@@ -30,6 +35,8 @@ from torchrl_h2o.data import Audit, DataError, audit
 from torchrl_h2o.data.readers.observed import words_of_estimates
 from torchrl_h2o.effects import CatalogueEntry, paper_gap
 from torchrl_h2o.envs import DynamicsGap
+from torchrl_h2o.experiment import Experiment, next_experiment, plan_experiment
+from torchrl_h2o.experiment.files import COMMANDS, PAGE
 from torchrl_h2o.options import CloseTheLoopOptions
 from torchrl_h2o.residuals import Report, Simulation, close_the_loop
 from torchrl_h2o.residuals.report.export import export
@@ -38,6 +45,10 @@ from torchrl_h2o.residuals.report.mended_model import FILE, save_mended_model
 from torchrl_h2o.residuals.report.sentence import sentences
 from torchrl_h2o.whole_file import whole_files
 
+DESIGN_MINUTES = 1.0  # of the CPU, to design an experiment, unless ``minutes`` is given
+PLANNED_STEP = 0.01  # s, control step of a first log, unless ``simulator.control_step`` is given
+DRIVEN = {int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)}
+OF_DESIGN = ("next", "seconds", "within", "speed", "band", "contact", "minutes", "data")
 FOR_FILES = 0.04  # share of ``minutes`` for writing the report and the mended model
 
 
@@ -86,9 +97,15 @@ def chosen_entries(cfg: DictConfig, simulation: Simulation) -> list[CatalogueEnt
 def main(cfg: DictConfig) -> None:
     begin = time.monotonic()
     directory = Path(HydraConfig.get().runtime.output_dir)
+    if cfg.plan is not None:
+        plan(cfg, directory)
+        return
     recording = read_recording(cfg)
     simulation = make_simulation(cfg, recording)
     recording = recording.for_simulation(simulation)
+    if cfg.next is not None:
+        design(cfg, simulation, recording, directory)
+        return
     entries = chosen_entries(cfg, simulation)
     audited = audit_data(cfg, recording, simulation)
 
@@ -119,6 +136,53 @@ def main(cfg: DictConfig) -> None:
     if cfg.export is not None:
         files = export(report, simulation, cfg.export)
         print(f"export     {', '.join(str(path) for path in files)}")
+
+
+def design(cfg: DictConfig, simulation: Simulation, recording: Recording, directory: Path) -> None:
+    """Design the experiment that decides what a report leaves open, print what it is expected to show, and write it.
+
+    Raises:
+        ValueError: if the report has no effects, the machine does not come to rest, or no commands keep the limits.
+    """
+    write(
+        next_experiment(simulation, recording.transitions, Report.load(cfg.next), **options_of_design(cfg)), directory
+    )
+    given = [one for one in HydraConfig.get().overrides.task if one.partition("=")[0] not in OF_DESIGN]
+    earlier = cfg.data if isinstance(cfg.data, str) else ",".join(cfg.data)
+    print(f"then       close-the-loop {shlex.join([*given, f'data=[NEW_LOG,{earlier}]'])}")
+
+
+def plan(cfg: DictConfig, directory: Path) -> None:
+    """Design the commands of a first log for a model, print which effects it would show, and write it.
+
+    Raises:
+        ValueError: if a joint has no name, an actuator has no range, the machine does not come to rest, or no commands
+            keep the limits.
+    """
+    simulation = Simulation.from_mjcf(cfg.plan, joints_of(cfg.plan), cfg.simulator.get("control_step") or PLANNED_STEP)
+    write(plan_experiment(simulation, noise=cfg.noise, **options_of_design(cfg)), directory)
+
+
+def joints_of(path: str) -> list[str]:
+    """Names of the hinges and slides of a model, and of their velocities, as coordinates."""
+    model = mujoco.MjModel.from_xml_path(path)
+    names = [model.joint(joint).name for joint in range(model.njnt) if int(model.jnt_type[joint]) in DRIVEN]
+    if not names or not all(names):
+        raise ValueError(f"plan={path}: each hinge and slide needs a name in the model")
+    return [*names, *(f"{name}_velocity" for name in names)]
+
+
+def options_of_design(cfg: DictConfig) -> dict[str, Any]:
+    """The options that a next and a first experiment share."""
+    shared = {name: cfg[name] for name in ("seconds", "within", "speed", "band", "contact", "seed")}
+    return shared | {"minutes": cfg.minutes or DESIGN_MINUTES}
+
+
+def write(experiment: Experiment, directory: Path) -> None:
+    """Write an experiment, and print what it is expected to show."""
+    experiment.save(directory)
+    folder = os.path.relpath(directory)
+    print(f"\n{experiment.words()}\n\ncommands   {folder}/{COMMANDS}\nlook at    {folder}/{PAGE}")
 
 
 def minutes_left(minutes: float | None, begin: float) -> float | None:
@@ -189,8 +253,10 @@ def print_files(report: Report, directory: Path) -> None:
 
 
 def expanded(argument: str) -> list[str]:
-    """Expand the short forms ``simulator=robot.xml`` and ``simulator=HalfCheetah-v5`` to options that Hydra accepts."""
+    """Expand the short forms ``simulator=robot.xml``, ``plan=robot.xml`` and ``simulator=HalfCheetah-v5`` for Hydra."""
     key, _, name = argument.partition("=")
+    if key == "plan" and name:
+        return [argument, "simulator=mjcf", f"simulator.path={name}"]
     if key == "simulator" and name.endswith((".xml", ".urdf")):
         return ["simulator=mjcf", f"simulator.path={name}"]
     if key == "simulator" and re.search(r"-v\d+$", name):

@@ -82,4 +82,14 @@ class CloseTheLoopOptions(Options):
     export: NewFolder | None = option(
         None, "folder for the ranges of the values, for domain randomisation in other projects"
     )
+    next: AnyPath | None = option(
+        None, "report.json of these data: designs the experiment that decides what it leaves open"
+    )
+    plan: AnyPath | None = option(None, "MJCF model: designs the first log, and says which effects it would show")
+    noise: Positive = option(0.001, "noise of the encoders with plan: its standard deviation, rad or m")
+    seconds: Positive = option(5.0, "duration of the experiment of next or plan, s")
+    within: Positive = option(0.5, "largest distance of a joint from its position at rest in it, rad or m")
+    speed: Positive = option(3.0, "largest velocity of a joint in it, rad/s or m/s")
+    band: Positive = option(3.0, "highest frequency of its commands, Hz")
+    contact: bool = option(False, "whether parts may touch in it that do not touch at rest")
     seed: Seed = option(0)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
 from itertools import chain
 
-from torchrl_h2o.effects import Effect, is_negligible
+from torchrl_h2o.effects import is_negligible
 from torchrl_h2o.likelihood import Difference
 from torchrl_h2o.residuals.elements import all_elements
 from torchrl_h2o.residuals.ground import GROWN, Found, Ground, kind_of
@@ -106,25 +106,22 @@ def _rivals(
 ) -> tuple[list[Found], list[list[Found]]]:
     """Sets that are better by another effect in an effect's place, and for each effect those that are as good.
 
-    The same effect on each of several joints or motors stays; terms of a force are replaced one by one. The better sets
-    are those of the first effect that has such; there are none unless ``may_swap``.
+    The same effect on each of several joints or motors is replaced on all of them, and terms of a force one by one. The
+    better sets are those of the first effect that has such; there are none unless ``may_swap``.
     """
-    alike: list[list[Found]] = []
-    for entry, effect in zip(found.entries, found.effects, strict=True):
+    alike: dict[str, list[Found]] = {entry.name: [] for entry in found.entries}
+    for names in _by_kind(found):
         advance()
-        if not _is_alone(effect, found):
-            alike.append([])
-            continue
-        fewer = ground.fitted(*found.without({entry.name}))
+        fewer = ground.fitted(*found.without(names))
         candidates = Candidates.of(ground, fewer, directions)
         others = _alike(ground, found, fewer, with_one_more(ground, candidates, instead_of=found))
         if not others:  # two effects say no more than one that explains the data as well
             pairs = with_one_more(ground, candidates, instead_of=found, pairs=True)
             others = _alike(ground, found, fewer, pairs)
         if may_swap and (better := _better(ground, others, found, directions)):
-            return better, alike
-        alike.append(sorted(others, key=lambda one: -one.scores.mean()))
-    return [], alike
+            return better, list(alike.values())
+        alike[min(names)] = sorted(others, key=lambda one: -one.scores.mean())
+    return [], list(alike.values())
 
 
 def _beyond(
@@ -135,13 +132,14 @@ def _beyond(
     advance: Callable[[], object],
 ) -> list[Found]:
     """Better sets than the one found: those that explain the data as well, with an effect on other elements."""
-    rivals = sorted(chain.from_iterable(alike), key=lambda one: -one.scores.mean())
-    for rival in rivals[:FOLLOWED]:
+    single = [one for one in chain.from_iterable(alike) if len(one.entries) >= len(found.entries)]
+    for rival in sorted(single, key=lambda one: -one.scores.mean())[:FOLLOWED]:
+        kinds = _by_kind(rival)
         for entry, effect in zip(rival.entries, rival.effects, strict=True):
             elsewhere = [
                 one for one in directions if type(one.entry.effect) is type(effect) and one.entry.name != entry.name
             ]
-            if elsewhere and entry.name in found.names and _is_alone(effect, rival):
+            if elsewhere and entry.name in found.names and {entry.name} in kinds:
                 advance()
                 fewer = ground.found(*rival.without({entry.name}))
                 candidates = Candidates.of(ground, fewer, elsewhere)
@@ -151,9 +149,12 @@ def _beyond(
     return []
 
 
-def _is_alone(effect: Effect, found: Found) -> bool:
-    """Whether a set has no other effect of this kind."""
-    return sum(kind_of(other) == kind_of(effect) for other in found.effects) == 1
+def _by_kind(found: Found) -> list[frozenset[str]]:
+    """Names of the entries of each kind of effects."""
+    kinds = dict[Hashable, set[str]]()
+    for entry, effect in zip(found.entries, found.effects, strict=True):
+        kinds.setdefault(kind_of(effect), set()).add(entry.name)
+    return [frozenset(names) for names in kinds.values()]
 
 
 def _better(ground: Ground, others: Sequence[Found], found: Found, directions: Sequence[Direction]) -> list[Found]:

@@ -18,7 +18,13 @@ from torchrl_h2o.effects import (
     ObservationDelay,
 )
 from torchrl_h2o.residuals import Simulation, StateMap
-from torchrl_h2o.residuals.judge.prediction_table import mean_errors, predicted, readings_of_joint
+from torchrl_h2o.residuals.judge.prediction_table import (
+    BETTER_THAN_GUESS,
+    Predicted,
+    mean_errors,
+    predicted,
+    readings_of_joint,
+)
 
 SIMULATION, DOUBLE_PENDULUM = pendulum(), double_pendulum()
 SLOW_ELBOW = (JointDamping(0.3, "shoulder"), JointDamping(1.0, "elbow"))
@@ -125,3 +131,13 @@ def test_the_same_seed_gives_the_same_and_leaves_the_random_state_alone():
     one, same = (of((Gravity(1.5),), seed=3).table for _ in range(2))
     assert one == same
     assert torch.equal(before, torch.get_rng_state())
+
+
+@pytest.mark.parametrize(("mended", "is_better"), [(0.0165, True), (0.0195, False)])
+def test_noise_that_nothing_predicts_does_not_count_against_the_effects(mended, is_better):
+    """The guess is wrong by 0.02, and the noise of the readings alone is 0.016."""
+    losses = {name: np.full((1, 8), error) for name, error in (("mended", mended), ("velocities_stay", 0.02))}
+    both = np.zeros((1, 8)), np.zeros((1, 8))
+    one = Predicted(("total",), 0.1, losses, (), both, (both[0][0], both[1][0]), np.array([0.016]))
+    assert (one.shares_of_guess[0] < BETTER_THAN_GUESS) == is_better
+    assert replace(one, noise=np.zeros(1)).shares_of_guess[0] > BETTER_THAN_GUESS

@@ -53,7 +53,7 @@ def learning(left, guess=100.0):
         "mended_and_network": left * error,
     }
     both = losses["as_it_is"], losses["mended"]
-    return Predicted(("total",), 0.1, losses, (("elbow", "rad", 1.0),), both, (both[0][0], both[1][0]))
+    return Predicted(("total",), 0.1, losses, (("elbow", "rad", 1.0),), both, (both[0][0], both[1][0]), np.zeros(1))
 
 
 @cache

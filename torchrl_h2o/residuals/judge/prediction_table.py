@@ -27,9 +27,11 @@ from torchrl_h2o.residuals.simulation.simulation import Simulation
 LEARNT = 0.8  # share of the error that a network may leave at most for something learnable to be missing
 FARTHEST = 10.0  # largest error of a reading that counts, in its spreads
 BETTER_THAN_GUESS = 0.8  # share of the guess's error up to which effects explain the motion
+CLEARLY = 0.3  # motion that the guess misses, in the noise of the readings, from which it is told from noise
 NEGLIGIBLE = 0.002  # errors below this, in spreads of the readings, do not count
 LITTLE = 0.02  # neither does what a network learns of an error below this share of the error without effects
 WORSE = 1.1  # factor on the error of a reading above which the effects make it worse
+OF_ABSOLUTE = math.sqrt(2.0 / math.pi)  # mean absolute value of normal noise, in its standard deviation
 TOTAL = "total"
 _COMPARED = ("mended", "velocities_stay")
 
@@ -45,6 +47,7 @@ class Predicted:
         readings: name, unit and spread of each reading.
         by_reading: for the simulator as it is and mended, absolute errors in these spreads, (n, W).
         one_step: for both, mean absolute error of all readings one step ahead, (V).
+        noise: mean absolute noise of the readings, in their spreads, (R).
     """
 
     names: tuple[str, ...]
@@ -53,6 +56,7 @@ class Predicted:
     readings: tuple[tuple[str, str, float], ...]
     by_reading: tuple[np.ndarray, np.ndarray]
     one_step: tuple[np.ndarray, np.ndarray]
+    noise: np.ndarray
 
     @cached_property
     def table(self) -> PredictionTable:
@@ -113,6 +117,18 @@ class Predicted:
         rose = HeadlineError(name, unit, self.seconds, float(spread * before[worst]), float(spread * after[worst]))
         return (f"at least one of these effects is wrong: they raise the error of {headline_words(rose)}",)
 
+    @cached_property
+    def shares_of_guess(self) -> np.ndarray:
+        """Error of the mended simulator, as a share of that of the guess that every velocity stays as it is, (R).
+
+        The noise of the readings, which nothing predicts, is taken from both where the guess misses by clearly more.
+        """
+        mended, stays = (self.losses[which].mean(1) for which in _COMPARED)
+        motion = np.sqrt(np.maximum(stays**2 - self.noise**2, 0.0))
+        above = np.sqrt(np.maximum(mended**2 - self.noise**2, 0.0)) / np.maximum(motion, NEGLIGIBLE)
+        is_clear = motion > np.maximum(CLEARLY * self.noise, NEGLIGIBLE)
+        return np.where(is_clear, above, mended / np.maximum(stays, NEGLIGIBLE))
+
     def hardly_better(self, simulation: Simulation, effects: Sequence[Effect]) -> tuple[str, ...]:
         """Says so if effects predict motion hardly better than the guess that every velocity stays as it is.
 
@@ -129,7 +145,7 @@ class Predicted:
         if not effects:
             return ()
         mended, stays = (dict(zip(self.names, self.losses[which].mean(1), strict=True)) for which in _COMPARED)
-        shares = {name: mended[name] / max(stays[name], NEGLIGIBLE) for name in self.names}
+        shares = dict(zip(self.names, self.shares_of_guess, strict=True))
         worst = TOTAL
         subject = "the effects found predict the motion"
         if shares[TOTAL] <= BETTER_THAN_GUESS:
@@ -174,10 +190,11 @@ def predicted(
     if len(judged) < HEADLINE_WINDOWS:
         return None
     spread = np.maximum(measured.observation.std(0), 1e-12)
-    rows, noisy = measured.reported_on(), sensor_noise(mended, measured) is not None
+    rows, sensors = measured.reported_on(), sensor_noise(mended, measured)
     every = np.unique(np.concatenate([judged, fitted, rows]))
     states = {
-        which: (estimate_states if noisy else start_states)(which, measured, every) for which in (simulation, mended)
+        which: (start_states if sensors is None else estimate_states)(which, measured, every)
+        for which in (simulation, mended)
     }
 
     def errors(which: Simulation, starts: np.ndarray, steps: int = steps) -> np.ndarray:
@@ -202,7 +219,9 @@ def predicted(
     nearest = [mean_errors(errors(which, rows, 1), next_known, readings[:1])[0] for which in (simulation, mended)]
     one_step = nearest[0], nearest[1]
     described = tuple(zip(simulation.state_map.names, simulation.state_map.units, spread.tolist(), strict=True))
-    return Predicted(names, steps * simulation.control_step, losses, described, (before, after), one_step)
+    scatter = OF_ABSOLUTE * (np.zeros(len(spread)) if sensors is None else sensors) / spread
+    noise = np.array([scatter[own].mean() for own in readings])
+    return Predicted(names, steps * simulation.control_step, losses, described, (before, after), one_step, noise)
 
 
 def at_constant_velocity(simulation: Simulation, states: np.ndarray, steps: int) -> np.ndarray:

@@ -27,6 +27,7 @@ _INK, _MUTED, _SHADE, _FLOOR, _ASIDE = "#010101", "#020202", "#030303", "#040404
 _VARIABLES = {_INK: "--ink", _MUTED: "--muted", _SHADE: "--shade", _FLOOR: "--floor", _ASIDE: "--aside"}
 # points are drawn as an image with fixed colours, which are legible on light and dark pages
 BEFORE, AFTER = "#d9730d", "#2a7de1"
+LINES = ("#2a7de1", "#d9730d", "#1f9d6b", "#a44bd3", "#c2334d")
 
 _STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
@@ -100,6 +101,21 @@ def _frame(quantity: WindowQuantity) -> tuple[float, float]:
     shown = np.concatenate([measured, np.clip(simulated, low - reach, high + reach)])
     margin = 0.06 * (np.ptp(shown) or 1.0)
     return float(shown.min() - margin), float(shown.max() + margin)
+
+
+def motions_in_time(
+    times: np.ndarray, lines: np.ndarray, name: str, unit: str, marked: Sequence[tuple[float, float]]
+) -> str:
+    """Draws a quantity over time, a line each of ``lines``, (K, T), with marked spans of time."""
+    with matplotlib.rc_context(_STYLE):
+        figure, axes = _figure()
+        for begin, end in marked:
+            axes.axvspan(begin, end, color=_ASIDE, linewidth=0)
+        for index, line in enumerate(lines):
+            axes.plot(times, line, color=LINES[index % len(LINES)], linewidth=1.3)
+        axes.set(xlabel="time, s", title=f"{name}, {_unit(unit)}", xlim=(times[0], times[-1]))
+        _plain_ticks(axes)
+        return _svg(figure, f"{name} over time, {_unit(unit)}")
 
 
 def residual_in_time(trace: ResidualTrace, dimension: int, aside: Sequence[Interval] = ()) -> str:
