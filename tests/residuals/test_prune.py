@@ -51,6 +51,21 @@ def test_the_better_effect_takes_the_place_of_another_and_what_is_idle_then_goes
     assert bias.bias == pytest.approx(0.05, rel=0.05)
 
 
+def test_one_effect_takes_the_place_of_the_same_effect_on_two_motors():
+    """Two weak motors hardly lift what a heavy link weighs."""
+    simulation = double_pendulum()
+    measured = recorded(simulation.with_effects(BodyMass(1.3, "lower")), 2000, 0.002)
+    catalogue = [entry for entry in simulation.catalogue() if isinstance(entry.effect, ActionGain | BodyMass)]
+    start = known_set(catalogue, (ActionGain(0.85, (0,)), ActionGain(0.8, (1,))))
+    ground = Ground.of(simulation, measured, start.effects)
+    found = ground.fitted(start.entries, start.effects)
+    directions = sweep(ground.rough(found.effects), catalogue, found.effects)
+    changed, _ = replaced(ground, found, directions, lambda: None)
+    (mass,) = changed.effects
+    assert isinstance(mass, BodyMass)
+    assert mass.scale == pytest.approx(1.3, rel=0.05)
+
+
 @pytest.mark.parametrize(("worse_by", "takes_the_place"), [(0.0, True), (0.5, True), (1.0, False)])
 def test_a_usual_effect_takes_the_place_of_an_unusual_one_that_explains_hardly_more(
     worse_by, takes_the_place, monkeypatch
