@@ -10,6 +10,7 @@ from itertools import chain
 from torchrl_h2o.effects import is_negligible
 from torchrl_h2o.likelihood import Difference
 from torchrl_h2o.residuals.elements import all_elements
+from torchrl_h2o.residuals.gains import OF_JOINTS
 from torchrl_h2o.residuals.ground import GROWN, Found, Ground, kind_of
 from torchrl_h2o.residuals.grow import (
     ALIKE,
@@ -106,12 +107,15 @@ def _rivals(
 ) -> tuple[list[Found], list[list[Found]]]:
     """Sets that are better by another effect in an effect's place, and for each effect those that are as good.
 
-    The same effect on each of several joints or motors is replaced on all of them, and terms of a force one by one. The
-    better sets are those of the first effect that has such; there are none unless ``may_swap``.
+    The same effect on each of several motors or bodies is replaced on all of them, and terms of a force one by one.
+    Friction, damping and rotors of several joints stay, because every joint has them. The better sets are those of the
+    first effect that has such; there are none unless ``may_swap``.
     """
     alike: dict[str, list[Found]] = {entry.name: [] for entry in found.entries}
-    for names in _by_kind(found):
+    for kind, names in _by_kind(found).items():
         advance()
+        if len(names) > 1 and kind in OF_JOINTS:
+            continue
         fewer = ground.fitted(*found.without(names))
         candidates = Candidates.of(ground, fewer, directions)
         others = _alike(ground, found, fewer, with_one_more(ground, candidates, instead_of=found))
@@ -134,7 +138,7 @@ def _beyond(
     """Better sets than the one found: those that explain the data as well, with an effect on other elements."""
     single = [one for one in chain.from_iterable(alike) if len(one.entries) >= len(found.entries)]
     for rival in sorted(single, key=lambda one: -one.scores.mean())[:FOLLOWED]:
-        kinds = _by_kind(rival)
+        kinds = _by_kind(rival).values()
         for entry, effect in zip(rival.entries, rival.effects, strict=True):
             elsewhere = [
                 one for one in directions if type(one.entry.effect) is type(effect) and one.entry.name != entry.name
@@ -149,12 +153,12 @@ def _beyond(
     return []
 
 
-def _by_kind(found: Found) -> list[frozenset[str]]:
+def _by_kind(found: Found) -> dict[Hashable, set[str]]:
     """Names of the entries of each kind of effects."""
     kinds = dict[Hashable, set[str]]()
     for entry, effect in zip(found.entries, found.effects, strict=True):
         kinds.setdefault(kind_of(effect), set()).add(entry.name)
-    return [frozenset(names) for names in kinds.values()]
+    return kinds
 
 
 def _better(ground: Ground, others: Sequence[Found], found: Found, directions: Sequence[Direction]) -> list[Found]:
