@@ -28,6 +28,15 @@ def test_a_line_per_variant_and_a_column_per_seed():
     assert "| h2o_plus | 0.212 |" in text
 
 
+def test_many_seeds_have_a_line_each():
+    rows = [row("h2o_plus", seed, 1, others=o) for o in ("", "n_steps=10") for seed in range(13 if o else 14)]
+    lines = seed_tables(pd.DataFrame(rows)).splitlines()
+    assert "| seed | h2o_plus (defaults) | h2o_plus n_steps=10 |" in lines
+    assert "| 12 | 20 | 20 |" in lines
+    assert "| 13 | 20 |  |" in lines
+    assert "| all 30 s | 0 of 14 | 0 of 13 |" in lines
+
+
 def test_evaluations_during_training_are_lines_of_their_own():
     rows = [row("h2o_plus", 0, 1, at=str(at), seconds=str(at / 1000)) for at in (4000, 8000, 12000)]
     text = seed_tables(pd.DataFrame(rows), at=(4000, 8000))

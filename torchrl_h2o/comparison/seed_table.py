@@ -8,6 +8,7 @@ import pandas as pd
 from torchrl_h2o.comparison.markdown import markdown_table
 from torchrl_h2o.comparison.results_file import IDENTITY
 
+MOST_COLUMNS = 12  # seeds side by side; more of them have a line each
 EPISODE = 30.0  # s, an episode of the robot without a fall
 #: column, title and format of each table
 QUANTITIES = (
@@ -19,6 +20,8 @@ QUANTITIES = (
 
 def seed_tables(runs: pd.DataFrame, at: Sequence[int] = ()) -> str:
     """Format Markdown tables with a line per variant and a column per seed, for each environment and quantity.
+
+    Of many seeds, each has a line, and each variant a column.
 
     A variant is named by the settings in which the runs differ. The speed is shown for tasks in which the robot has to
     move, which do not observe its position.
@@ -56,12 +59,16 @@ def seed_tables(runs: pd.DataFrame, at: Sequence[int] = ()) -> str:
 def _table(runs: pd.DataFrame, quantity: str, form: str) -> str:
     values = runs.assign(value=runs[quantity].astype(float)).pivot(index="variant", columns="seed", values="value")
     values = values.loc[runs["variant"].unique()]  # in the order of the file
-    head, rows = ["variant", *(f"seed {seed}" for seed in values)], []
-    for variant, row in values.iterrows():
-        rows.append([str(variant), *("" if pd.isna(value) else format(value, form) for value in row)])
-        if quantity == "seconds":
-            rows[-1].append(f"{(row >= EPISODE).sum()} of {row.notna().sum()}")
-    return markdown_table([*head, *([f"all {EPISODE:g} s"] if quantity == "seconds" else [])], rows)
+    cells = values.map(lambda value: "" if pd.isna(value) else format(value, form))
+    cells.columns = [f"seed {seed}" for seed in values]
+    if quantity == "seconds":
+        whole = (values >= EPISODE).sum(axis=1), values.notna().sum(axis=1)
+        cells[f"all {EPISODE:g} s"] = [f"{stood} of {count}" for stood, count in zip(*whole, strict=True)]
+    if len(values.columns) > MOST_COLUMNS:
+        cells = cells.T
+    first = "seed" if len(values.columns) > MOST_COLUMNS else "variant"
+    rows = [[str(name).removeprefix("seed "), *row] for name, row in zip(cells.index, cells.to_numpy(), strict=True)]
+    return markdown_table([first, *cells.columns], rows)
 
 
 def _name(row: Mapping[Any, str], differ: Sequence[str]) -> str:
