@@ -33,7 +33,7 @@ from torchrl_h2o.data.readers.ted import to_ted
 from torchrl_h2o.effects import Gravity, JointDamping, JointForce, LoadFriction
 from torchrl_h2o.envs import WheelLeggedEnv, mujoco_model
 from torchrl_h2o.residuals import Report, Simulation
-from torchrl_h2o.residuals.report.contents import DataSummary, FoundEffect
+from torchrl_h2o.residuals.report.contents import DataSummary, FoundEffect, OtherExplanation
 from torchrl_h2o.residuals.report.errors import DimensionError, ErrorSummary
 from torchrl_h2o.residuals.report.mended_model import LeftOut, MendedModel
 from torchrl_h2o.residuals.report.words import effect_units, effect_words
@@ -262,7 +262,14 @@ def test_what_is_printed_is_short_and_has_units(capsys, tmp_path):
     for part in ("Your simulator lacks: gravity × 0.5", "0.49 to 0.51", "rad", "0.031", "0.004", "report.html"):
         assert part in printed
     assert "mend=" in printed
+    assert "next=" not in printed
     assert len(printed.splitlines()) < 20
+
+
+def test_where_other_explanations_are_left_open_the_command_that_decides_is_printed(capsys, tmp_path):
+    other = OtherExplanation((JointDamping(0.1, "pivot"),), 0.005, "")
+    print_files(dataclasses.replace(report(Gravity(0.5)), others=(other,)), tmp_path)
+    assert f"next={os.path.relpath(tmp_path)}/report.json" in capsys.readouterr().out
 
 
 def test_values_that_no_fit_changed_are_not_printed(capsys):

@@ -248,6 +248,8 @@ def print_files(report: Report, directory: Path) -> None:
         print(f"           {where}: {'; '.join(left.words for left in mended.left_out)}")
     if report.ended_in is not None and report.found:
         print(f"go on      close-the-loop ... start_from={folder}")
+    if report.others or report.indistinguishable:
+        print(f"decide     close-the-loop ... next={folder}/report.json")
     if report.recommended:
         print(f"train      python recipes/h2o_plus.py ... mend={folder}/report.json")
 
