@@ -78,9 +78,9 @@ def test_a_plan_says_what_it_would_show_and_writes_it(tmp_path):
     page = (tmp_path / "experiment.html").read_text()
     assert "What it would not show" in page
     assert "The explanations" not in page
+    assert 'src="preview.gif"' in page
     written = {path.name for path in tmp_path.iterdir()}
-    assert written - {"preview.gif"} == {"commands.csv", "experiment.html", "experiment.json"}
-    assert ("preview.gif" in written) == ("preview.gif" in page)
+    assert written == {"commands.csv", "experiment.html", "experiment.json", "preview.gif"}
 
 
 def test_without_a_renderer_all_but_the_film_is_written(tmp_path, monkeypatch, capsys):
