@@ -353,7 +353,7 @@ def test_the_next_and_the_first_experiment_are_designed(robot):
     report(JointDamping(0.1, "pivot")).save(robot / "found")
     done = command(robot, *log, "next=found/report.json", "minutes=0.02", "seconds=2", "hydra.run.dir=out")
     assert done.returncode == 0, done.stdout
-    assert "One explanation is left. The experiment narrows its intervals" in done.stdout
+    assert "The report leaves no other explanation open. The experiment narrows its intervals" in done.stdout
     (then,) = [line for line in done.stdout.splitlines() if line.startswith("then")]
     _, _, *again = shlex.split(then)
     assert again[-1] == "data=[NEW_LOG,log.csv]"
