@@ -86,7 +86,8 @@ class Experiment:
             return self._words_of_plan()
         if count == 1:
             shares = ", ".join(f"{one.words} to {one.share:.0%}" for one in self.narrowing)
-            return f"The report leaves no other explanation open. The experiment narrows its intervals: {shares} of their width."
+            told = "The report leaves no other explanation open. The experiment narrows its intervals"
+            return f"{told}: {shares} of their width."
         lines = []
         for rival in range(1, count):
             both = self.told_apart[0, rival], self.told_apart[rival, 0]
