@@ -267,7 +267,7 @@ def test_what_is_printed_is_short_and_has_units(capsys, tmp_path):
 
 
 def test_where_other_explanations_are_left_open_the_command_that_decides_is_printed(capsys, tmp_path):
-    other = OtherExplanation((JointDamping(0.1, "pivot"),), 0.005, "")
+    other = OtherExplanation((JointDamping(0.1, "pivot"),), 0.005)
     print_files(dataclasses.replace(report(Gravity(0.5)), others=(other,)), tmp_path)
     assert f"next={os.path.relpath(tmp_path)}/report.json" in capsys.readouterr().out
 

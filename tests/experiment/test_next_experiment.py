@@ -130,7 +130,7 @@ def report():
         simulator="double pendulum",
         data=DataSummary("log.csv", 800, 200),
         found=found,
-        others=(OtherExplanation(WRONG, 0.1, ""),),
+        others=(OtherExplanation(WRONG, 0.1),),
     )
 
 

@@ -58,7 +58,7 @@ def found(*effects, others=()):
         FoundEffect(e, True, {n: (0.96 * p.value, 1.04 * p.value) for n, p in e.parameters.items()}, 0.1)
         for e in effects
     ]
-    groups = (IndistinguishableGroup((effects[0], *others), (0.1,) * (1 + len(others)), "motion"),) if others else ()
+    groups = (IndistinguishableGroup((effects[0], *others), (0.1,) * (1 + len(others))),) if others else ()
     return Report(
         simulator="made up",
         data=DataSummary("recorded, all 200 rows", 200, 60),

@@ -59,7 +59,6 @@ def compose_report(
             IndistinguishableGroup(
                 group.effects,
                 group.errors,
-                group.separated_by,
                 tuple(map(words, group.effects)),
                 tuple(together.get(effect, ()) for effect in group.effects),
             )
@@ -80,8 +79,7 @@ def compose_report(
         ended_in=explanation.ended_in,
         left_out=judgement.left_out,
         others=tuple(
-            OtherExplanation(effects, error, where, tuple(map(words, effects)))
-            for effects, error, where in judgement.others
+            OtherExplanation(effects, error, tuple(map(words, effects))) for effects, error in judgement.others
         ),
     )
 

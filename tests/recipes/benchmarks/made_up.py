@@ -11,6 +11,6 @@ def report(*effects, before=1.0, after=0.0, floor=None, declared=True, groups=()
         data=DataSummary("made up", 100, 30),
         error=ErrorSummary("one-step RMSE", "1", before, after, floor),
         found=tuple(FoundEffect(effect, declared, {}, after) for effect in effects),
-        indistinguishable=tuple(IndistinguishableGroup(tuple(g), (after,) * len(g), "more motion") for g in groups),
+        indistinguishable=tuple(IndistinguishableGroup(tuple(g), (after,) * len(g)) for g in groups),
         conclusion=conclusion,
     )

@@ -39,7 +39,7 @@ def test_a_machine_is_right_with_all_faults_and_no_more_than_lateness(more, pass
     case = draw_case(FAMILIES, "machines", 6, SEED)
     bias = ActionBias(0.24, (2,))
     found = (JointSpring(0.8, "knee"), bias, *more)
-    groups = (IndistinguishableGroup((bias, JointForce(0.24, "knee")), (0.0, 0.0), "more motion"),)
+    groups = (IndistinguishableGroup((bias, JointForce(0.24, "knee")), (0.0, 0.0)),)
     report = Report(
         simulator="made up",
         data=DataSummary("made up", 100, 30),

@@ -44,11 +44,7 @@ def full_report() -> Report:
             RejectedEffect(ActionGain(0.83), 0.0061, 0.003, "not on the list of the best"),
             RejectedEffect(ActionGain(-9.0, (1,)), float("inf"), None, "diverges"),
         ),
-        indistinguishable=(
-            IndistinguishableGroup(
-                (BodyMass(1.21, "pole"), ActionGain(0.83, (0,))), (0.006, 0.0061), "motion without any torque"
-            ),
-        ),
+        indistinguishable=(IndistinguishableGroup((BodyMass(1.21, "pole"), ActionGain(0.83, (0,))), (0.006, 0.0061)),),
         predictions=predictions(),
         unexplained_intervals=(Interval(14.2, 14.9, 70, 38.0, "a push from outside"),),
         steps=(
@@ -166,7 +162,7 @@ def renamed(report: Report, text: str) -> Report:
             summary, metric=text, unit=text, per_dimension=tuple(dimensions), horizons=tuple(horizons)
         ),
         rejected=tuple(dataclasses.replace(rejected, reason=text) for rejected in report.rejected),
-        indistinguishable=tuple(dataclasses.replace(g, separated_by=text) for g in report.indistinguishable),
+        indistinguishable=tuple(dataclasses.replace(g, words=(text, text)) for g in report.indistinguishable),
         unexplained_intervals=tuple(dataclasses.replace(i, set_aside=text) for i in report.unexplained_intervals),
         steps=tuple(dataclasses.replace(step, put_in=(text,), dropped=(text,)) for step in report.steps),
         stop_test=text,

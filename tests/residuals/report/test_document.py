@@ -75,7 +75,7 @@ def test_names_without_a_conclusion_are_refused():
 
 def test_a_group_needs_an_error_for_each_effect():
     with pytest.raises(ValueError, match="2 effects has 1 errors"):
-        IndistinguishableGroup((Gravity(2.0), ActionGain(2.0)), (0.1,), "more data")
+        IndistinguishableGroup((Gravity(2.0), ActionGain(2.0)), (0.1,))
 
 
 def test_the_effects_of_a_report_make_a_dynamics_gap():
@@ -184,7 +184,7 @@ def test_the_file_is_strict_json_and_reads_back_what_it_was_given(number, option
         full,
         found=(FoundEffect(Gravity(2.0), False, {"scale": (low, number)}, number),),
         rejected=(RejectedEffect(paper_gap("soft_feet"), number, optional, "diverges"),),
-        indistinguishable=(IndistinguishableGroup((Gravity(2.0), BodyMass(1.5)), (number, low), "more data"),),
+        indistinguishable=(IndistinguishableGroup((Gravity(2.0), BodyMass(1.5)), (number, low)),),
         error=ErrorSummary("RMSE", "1", low, number, optional, (dimension,), (horizon,)),
         predictions=PredictionTable(0.1, (PredictedRow("total", *[Prediction(number, low, number)] * 4),)),
         wall_s=optional,

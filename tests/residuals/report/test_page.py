@@ -86,9 +86,8 @@ def test_the_page_names_every_effect_that_was_tried(full):
         assert tried.words in full.text
     for rejected in report.rejected:
         assert rejected.reason in full.text
-    for group in report.indistinguishable:
-        assert group.separated_by in full.text
-        assert "actuators 0 × 0.83" in full.text
+    assert "actuators 0 × 0.83" in full.text
+    assert "The option next of close-the-loop designs the log that tells them apart" in full.text
 
 
 def test_the_page_shows_what_each_step_of_the_search_put_in_and_gained(full):
@@ -189,7 +188,7 @@ def test_hostile_texts_are_shown_and_not_obeyed():
     assert not parsed.open
     assert parsed.count("script") == 0
     assert "<script" not in page
-    for place in (f"against {HOSTILE}", f"left out: {HOSTILE}", f"{HOSTILE}elbow angle", f"record {HOSTILE}"):
+    for place in (f"against {HOSTILE}", f"left out: {HOSTILE}", f"{HOSTILE}elbow angle", f"{HOSTILE} (put in)"):
         assert place in parsed.text
     labels = [attributes["aria-label"] for tag, attributes in parsed.tags if tag == "svg"]
     assert any(HOSTILE in label for label in labels)

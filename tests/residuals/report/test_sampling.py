@@ -24,7 +24,7 @@ def report(*found, groups=()):
 def group(first, *explanations):
     """Alternatives to an effect; each explanation begins with the alternative, followed by the effects beside it."""
     effects = (first, *(explanation[0][0] for explanation in explanations))
-    return IndistinguishableGroup(effects, (0.1,) * len(effects), "faster motion", together=((), *explanations))
+    return IndistinguishableGroup(effects, (0.1,) * len(effects), together=((), *explanations))
 
 
 def test_values_are_normal_with_the_interval_of_the_report():
@@ -51,7 +51,7 @@ def test_draws_repeat_with_their_seed_and_a_longer_sample_begins_with_the_shorte
 
 def test_other_sets_of_effects_are_drawn_as_often_as_the_effects_found():
     found = report((Gravity(0.5), {}))
-    other = OtherExplanation((BodyMass(1.2), JointDamping(0.1)), 0.1, "faster motion")
+    other = OtherExplanation((BodyMass(1.2), JointDamping(0.1)), 0.1)
     draws = dataclasses.replace(found, others=(other,)).sample(1000)
     assert set(draws) == {(Gravity(0.5),), (BodyMass(1.2), JointDamping(0.1))}
     assert draws.count(other.effects) == pytest.approx(500, abs=60)

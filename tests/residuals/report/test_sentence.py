@@ -45,7 +45,7 @@ def test_the_sentence_counts_what_else_it_could_be_where_naming_all_would_bury_i
     ],
 )
 def test_the_sentence_names_one_other_set_and_counts_the_rest(count, words):
-    other = OtherExplanation((Gravity(0.5),), 0.1, "motion")
+    other = OtherExplanation((Gravity(0.5),), 0.1)
     assert words in dataclasses.replace(full_report(), others=(other,) * count).sentence()
 
 

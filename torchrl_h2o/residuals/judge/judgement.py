@@ -17,7 +17,6 @@ from torchrl_h2o.residuals.judge.caveats import undetermined_values
 from torchrl_h2o.residuals.judge.held_out_error import error_summary, overall_error, with_floor, with_horizons
 from torchrl_h2o.residuals.judge.prediction_table import Predicted, predicted
 from torchrl_h2o.residuals.judge.run_errors import run_errors
-from torchrl_h2o.residuals.judge.separation import difference_between, separated_by
 from torchrl_h2o.residuals.judge.shown_windows import shown_windows
 from torchrl_h2o.residuals.judge.verdict import reach_verdict
 from torchrl_h2o.residuals.measured.outside import OutsideInterval, still_outside, without_intervals
@@ -43,12 +42,10 @@ class Alternatives:
     Args:
         effects: the effects; the first is the one put in.
         errors: held-out error with each of them.
-        separated_by: description of the data that would tell them apart.
     """
 
     effects: tuple[Effect, ...]
     errors: tuple[float, ...]
-    separated_by: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +65,7 @@ class Judgement:
         runs: error of each run.
         verdict: what these figures say.
         failures: attempts that failed with an error, and why.
-        others: error and separating data of each other set of effects that explains the data as well.
+        others: each other set of effects that explains the data as well, with its error.
         left_out: parts that were not computed because the time was up, in words.
     """
 
@@ -84,7 +81,7 @@ class Judgement:
     runs: tuple[RunError, ...]
     verdict: Verdict
     failures: tuple[str, ...] = ()
-    others: tuple[tuple[tuple[Effect, ...], float, str], ...] = ()
+    others: tuple[tuple[tuple[Effect, ...], float], ...] = ()
     left_out: tuple[str, ...] = ()
 
 
@@ -156,7 +153,7 @@ def _details(
     unknown = (math.nan,) * len(effects)
     errors_after = optional("errors of each effect", lambda: _errors_after(simulation, effects, measured), unknown)
     alternatives = optional("errors of alternatives", lambda: _all_alternatives(simulation, measured, explanation), ())
-    others = optional("other sets", lambda: _others(simulation, mended, measured, explanation), ())
+    others = optional("other sets", lambda: _others(simulation, measured, explanation), ())
     if error is not None:
         error = optional("errors ahead", partial(with_horizons, error, simulation, mended, measured), error)
         error = optional("the floor", partial(with_floor, error, mended, measured), error)
@@ -280,23 +277,19 @@ def _alternatives(
     others: tuple[Alternative, ...],
 ) -> Alternatives:
     """An effect and its alternatives, each judged together with the remaining effects as they were fitted with it."""
-    before, after = effects[:index], effects[index + 1 :]
     sets = [_without_noise(effects), *([effect for effect, _ in other.together] for other in others)]
     errors = (overall_error(simulation.with_effects(*one), measured) for one in sets)
     alike = (effects[index], *(other.effect for other in others))
-    where = separated_by(simulation, measured, alike, _without_noise(before), _without_noise(after))
-    return Alternatives(alike, tuple(errors), where)
+    return Alternatives(alike, tuple(errors))
 
 
 def _others(
-    simulation: Simulation, mended: Simulation, measured: Measured, explanation: Explanation
-) -> tuple[tuple[tuple[Effect, ...], float, str], ...]:
-    """Each other set of effects with its error, and the data that would distinguish it from the effects found."""
-    others = []
-    for effects in explanation.others:
-        other = simulation.with_effects(*effects)
-        others.append((effects, overall_error(other, measured), difference_between((mended, other), measured)))
-    return tuple(others)
+    simulation: Simulation, measured: Measured, explanation: Explanation
+) -> tuple[tuple[tuple[Effect, ...], float], ...]:
+    """Each other set of effects with its error."""
+    return tuple(
+        (effects, overall_error(simulation.with_effects(*effects), measured)) for effects in explanation.others
+    )
 
 
 def _residual_trace(simulation: Simulation, mended: Simulation, measured: Measured) -> ResidualTrace:

@@ -14,7 +14,7 @@ from torchrl_h2o.residuals.estimated_states import sensor_noise
 from torchrl_h2o.residuals.judge.caveats import friction_beside_noise, only_ratios
 from torchrl_h2o.residuals.judge.headline import HEADLINE_WINDOWS
 from torchrl_h2o.residuals.judge.prediction_table import NEGLIGIBLE, Predicted
-from torchrl_h2o.residuals.judge.separation import DESCRIBED_SHARE, UNUSUAL_FACTOR, where_it_is_large
+from torchrl_h2o.residuals.judge.where import DESCRIBED_SHARE, where_it_is_large
 from torchrl_h2o.residuals.measured.error_over_noise import errors_and_noise
 from torchrl_h2o.residuals.measured.in_motion import in_motion
 from torchrl_h2o.residuals.measured.residual import residuals
@@ -235,5 +235,5 @@ def where_most(simulation: Simulation, measured: Measured) -> str:
     begin, end = (number(float(measured.time[row]), 3) for row in ends)
     run = f" (run {' to '.join(map(str, np.unique(measured.run[ends])))})" if measured.run[-1] > 0 else ""
     most = np.argsort(size[:, dimension])[-max(1, round(DESCRIBED_SHARE * len(rows))) :]
-    where = where_it_is_large(simulation, measured, rows, size[:, dimension], most, UNUSUAL_FACTOR)
+    where = where_it_is_large(simulation, measured, rows, size[:, dimension], most)
     return f"most in {simulation.state_map.names[dimension]}, between {begin} and {end} s{run}{where and ',' + where}"

@@ -127,7 +127,6 @@ class IndistinguishableGroup:
     Args:
         effects: the effects, each at its best fit; the first is the one put in.
         errors: held-out error with each of them in place of the first, in the summary's unit.
-        separated_by: description of the data that would tell them apart.
         words: description of each effect with units; by default those of the effects.
         together: for each effect, all effects of the explanation with this one in the first's place, as they were
             fitted together; entries are empty if unknown, as in files of earlier versions. The other effects' values
@@ -139,7 +138,6 @@ class IndistinguishableGroup:
 
     effects: tuple[Effect, ...]
     errors: tuple[float, ...]
-    separated_by: str
     words: tuple[str, ...] = ()
     together: tuple[Fitted, ...] = ()
 
@@ -163,13 +161,11 @@ class OtherExplanation:
     Args:
         effects: the effects, fitted together.
         error: held-out error with them, in the summary's unit.
-        separated_by: description of the data that would tell it from the effects found.
         words: description of each effect with units; by default those of the effects.
     """
 
     effects: tuple[Effect, ...]
     error: float
-    separated_by: str
     words: tuple[str, ...] = ()
 
     def __post_init__(self):

@@ -113,7 +113,6 @@ def report_to_json(report: ReportContents) -> dict[str, Any]:
                             group.effects, group.errors, group.words, group.together, strict=True
                         )
                     ],
-                    "separated_by": group.separated_by,
                 }
                 for group in report.indistinguishable
             ],
@@ -124,7 +123,6 @@ def report_to_json(report: ReportContents) -> dict[str, Any]:
                     "effects": [effect_to_dict(effect) for effect in other.effects],
                     "words": other.words,
                     "error": other.error,
-                    "separated_by": other.separated_by,
                 }
                 for other in report.others
             ],
@@ -283,7 +281,6 @@ def _group(entry: Mapping[str, Any]) -> IndistinguishableGroup:
     return IndistinguishableGroup(
         effects=tuple(effect_from_dict(member["effect"]) for member in members),
         errors=tuple(_float(member["error"]) for member in members),
-        separated_by=entry["separated_by"],
         words=tuple(member["words"] for member in members if "words" in member),
         together=tuple(
             tuple((effect_from_dict(other["effect"]), _intervals(other["ci95"])) for other in member["together"])
