@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import permutations
 
 import numpy as np
 
@@ -99,10 +98,12 @@ class Setting:
     def nats(self, knots: np.ndarray) -> dict[tuple[int, int], float]:
         """Expected log likelihood ratio of each explanation against each other, if the first one is the truth."""
         found = {}
-        for i, j in permutations(range(len(self.explanations)), 2):
+        for i, truth in enumerate(self.explanations):
             motion = self.motion(i, knots)
-            seen = predicted(self.explanations[i].simulation, motion, self.yard)
-            found[i, j] = nats_apart(motion, self.explanations[j], seen, self.yard)
+            seen = predicted(truth.simulation, motion, self.yard)
+            for j, rival in enumerate(self.explanations):
+                if j != i:
+                    found[i, j] = nats_apart(motion, rival, seen, self.yard)
         return found
 
     def value(self, knots: np.ndarray) -> float:
@@ -111,9 +112,10 @@ class Setting:
         None of the explanations may be the truth. So it also counts, with a smaller weight, how far effects of the
         catalogue that are not in the first one would show.
         """
-        own = self.narrowing(knots)
         if len(self.explanations) > 1:
             own = float(np.minimum(list(self.nats(knots).values()), SUFFICES).mean())
+        else:
+            own = self.narrowing(knots)
         if not self.unknown:
             return own
         return own + UNKNOWN * float(np.minimum(self.overlaps(knots).diagonal(), SUFFICES).mean())
@@ -137,7 +139,6 @@ def best_commands(
     rng: np.random.Generator,
     budget: float,
     *,
-    families: Sequence[str] = tuple(FAMILIES),
     value: Callable[[np.ndarray], float] | None = None,
     show: Callable[[float], object] = lambda share: None,
 ) -> np.ndarray:
@@ -147,7 +148,6 @@ def best_commands(
         setting: what they are for.
         rng: draws candidates.
         budget: time to search, in s of the process's CPU.
-        families: kinds of candidates.
         value: what knots are worth; by default :meth:`Setting.value`.
         show: called with the share of the budget that has passed.
 
@@ -161,7 +161,7 @@ def best_commands(
         return (time.process_time() - begin) / budget
 
     while passed() < FOR_CANDIDATES or not found:
-        family = families[tried % len(families)]
+        family = list(FAMILIES)[tried % len(FAMILIES)]
         drawn = setting.largest(candidate(family, setting.seconds, len(setting.command), setting.band, rng))
         tried += 1
         if drawn is not None and not setting.touches(drawn):

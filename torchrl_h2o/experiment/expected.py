@@ -12,27 +12,27 @@ import torch
 from scipy.special import ndtr
 from tensordict import TensorDict, TensorDictBase
 
+from torchrl_h2o.data.readers.ted import to_ted
 from torchrl_h2o.experiment.design import Setting
 from torchrl_h2o.experiment.separation import Motion, information_of
 from torchrl_h2o.likelihood import Difference
 from torchrl_h2o.residuals.ground import Ground
 from torchrl_h2o.residuals.grow import ALIKE, advantage
 from torchrl_h2o.residuals.measured.transitions import Measured
+from torchrl_h2o.residuals.report.words import effect_words
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
 
 @dataclass(frozen=True)
-class Narrowed:
-    """A value of the likeliest explanation before and after the experiment.
+class Narrowing:
+    """A value of the likeliest explanation.
 
     Args:
-        effect: index of the effect.
-        name: name of its parameter.
-        share: width of the 95 % interval afterwards, as a share of that before.
+        words: the effect and its parameter.
+        share: expected width of the 95 % interval afterwards, as a share of that before.
     """
 
-    effect: int
-    name: str
+    words: str
     share: float
 
 
@@ -72,13 +72,14 @@ def told_apart(
     return found
 
 
-def narrowed(setting: Setting, knots: np.ndarray) -> tuple[Narrowed, ...]:
+def narrowed(setting: Setting, knots: np.ndarray) -> tuple[Narrowing, ...]:
     """How far the experiment narrows the values of the likeliest explanation."""
     one = setting.explanations[0]
     more = information_of(one, setting.motion(0, knots), setting.yard)
     before, after = (np.sqrt(np.diag(np.linalg.inv(each))) for each in (one.information, one.information + more))
+    words = [effect_words(effect, setting.base.names) for effect in one.found.effects]
     return tuple(
-        Narrowed(variable.effect, variable.name, float(share))
+        Narrowing(f"{words[variable.effect]} ({variable.name})", float(share))
         for variable, share in zip(one.variables, after / before, strict=True)
     )
 
@@ -96,9 +97,8 @@ def simulated_log(
         rng: draws the noise.
     """
     motion = Motion.of(simulation, setting.rest, setting.commands(knots))
-    readings = simulation.observed(motion.states)
-    readings = readings + setting.noise * rng.standard_normal(readings.shape)
-    return as_ted(readings, motion.actions, like)
+    noise = setting.noise * rng.standard_normal(motion.readings.shape)
+    return as_ted(motion.readings + noise, motion.actions, like)
 
 
 def as_ted(readings: np.ndarray, actions: np.ndarray, like: TensorDictBase | None = None) -> TensorDict:
@@ -111,27 +111,12 @@ def as_ted(readings: np.ndarray, actions: np.ndarray, like: TensorDictBase | Non
         >>> as_ted(np.zeros((4, 2)), np.zeros((3, 1)))["next", "observation"].shape
         torch.Size([3, 2])
     """
-    steps = len(actions)
-    no, last = torch.zeros(steps, 1, dtype=torch.bool), torch.zeros(steps, 1, dtype=torch.bool)
-    last[-1] = True
-    kind = torch.float64 if like is None else like["observation"].dtype
-    ted = TensorDict(
-        {
-            "observation": torch.as_tensor(readings[:-1], dtype=kind),
-            "action": torch.as_tensor(actions, dtype=kind),
-            **{key: no.clone() for key in ("done", "terminated", "truncated")},
-            "next": {
-                "observation": torch.as_tensor(readings[1:], dtype=kind),
-                "reward": torch.zeros(steps, 1),
-                "done": last,
-                "terminated": no.clone(),
-                "truncated": last.clone(),
-            },
-        },
-        [steps],
+    ends = np.zeros(len(actions), bool)
+    ted = to_ted(
+        observation=readings[:-1], action=actions, next_observation=readings[1:], terminated=ends, truncated=ends
     )
     if like is not None and "observation_std" in like.keys():
-        ted["observation_std"] = like["observation_std"][:1].expand(steps, -1).clone()
+        ted["observation_std"] = like["observation_std"][:1].expand(len(ted), -1).clone()
     return ted
 
 

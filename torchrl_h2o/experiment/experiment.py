@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from torchrl_h2o.experiment.design import Setting
-from torchrl_h2o.experiment.expected import narrowed
+from torchrl_h2o.experiment.expected import Narrowing, narrowed
 from torchrl_h2o.experiment.separation import predicted
 from torchrl_h2o.experiment.shown import Shown, shown_effects
 from torchrl_h2o.residuals.report.words import effect_words, quantity
@@ -17,33 +17,15 @@ from torchrl_h2o.residuals.simulation.simulation import Simulation
 LISTED = 12  # effects that the words list
 
 
-@dataclass(frozen=True)
-class Narrowing:
-    """A value of the likeliest explanation.
-
-    Args:
-        words: the effect and its parameter.
-        share: expected width of the 95 % interval afterwards, as a share of that before.
-    """
-
-    words: str
-    share: float
-
-
 @dataclass(frozen=True, eq=False)
 class Experiment:
     """Commands for a machine, and what they are expected to show.
 
     Args:
         commands: (T, nu), in the order of the actuators.
-        control_step: time between two commands, in s.
-        actuators: names of the actuators.
-        command_units: units of the commands; empty if they are not known.
         explanations: the effects of each explanation in words, the likeliest first.
-        readings: names of the readings.
-        units: units of the readings.
         motions: predicted readings of each explanation, (K, T + 1, n).
-        simulator: the simulator of the likeliest explanation.
+        simulator: that of the likeliest explanation, with the control step and the names and units of both.
         states: its motion, before each command and after the last one, (T + 1, nq + nv).
         nats: by how much the predictions of the others differ, in nats for each block of control steps, (blocks).
         block_seconds: duration of a block, in s.
@@ -53,12 +35,7 @@ class Experiment:
     """
 
     commands: np.ndarray
-    control_step: float
-    actuators: tuple[str, ...]
-    command_units: tuple[str, ...]
     explanations: tuple[tuple[str, ...], ...]
-    readings: tuple[str, ...]
-    units: tuple[str, ...]
     motions: np.ndarray
     simulator: Simulation
     states: np.ndarray
@@ -71,7 +48,7 @@ class Experiment:
     @property
     def seconds(self) -> float:
         """Duration, in s."""
-        return len(self.commands) * self.control_step
+        return len(self.commands) * self.simulator.control_step
 
     def save(self, folder: str | Path) -> None:
         """Writes ``commands.csv``, ``experiment.json``, a page, and a film of the motion if MuJoCo can render here."""
@@ -117,20 +94,13 @@ def experiment_of(setting: Setting, knots: np.ndarray, apart: np.ndarray) -> Exp
     nats = [((other - first) ** 2).mean(1).sum(1) / 2.0 for other in others]
     return Experiment(
         commands=setting.commands(knots),
-        control_step=simulation.control_step,
-        actuators=simulation.actuators,
-        command_units=simulation.action_units,
         explanations=words,
-        readings=tuple(simulation.state_map.names),
-        units=tuple(simulation.state_map.units),
-        motions=np.stack([simulation.observed(motion.states) for motion in motions]),
+        motions=np.stack([motion.readings for motion in motions]),
         simulator=explanations[0].simulation,
         states=motions[0].states,
         nats=np.mean(nats, axis=0) if nats else np.zeros(len(first)),
         block_seconds=setting.yard.steps * simulation.control_step,
         told_apart=apart,
-        narrowing=tuple(
-            Narrowing(f"{words[0][one.effect]} ({one.name})", one.share) for one in narrowed(setting, knots)
-        ),
+        narrowing=narrowed(setting, knots),
         shown=shown_effects(setting, knots),
     )

@@ -7,12 +7,12 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import jinja2
 import numpy as np
 from tqdm import tqdm
 
 from torchrl_h2o.experiment.preview import film_motion
 from torchrl_h2o.residuals.report import plots
+from torchrl_h2o.residuals.report.templates import templates
 from torchrl_h2o.residuals.report.words import quantity
 from torchrl_h2o.whole_file import whole_files, write_text
 
@@ -27,9 +27,8 @@ def write_files(experiment: Experiment, folder: Path) -> None:
     """Writes all files; they appear together."""
     folder.mkdir(parents=True, exist_ok=True)
     with whole_files(folder) as files:
-        rows = [
-            [index * experiment.control_step, *commands] for index, commands in enumerate(experiment.commands.tolist())
-        ]
+        step = experiment.simulator.control_step
+        rows = [[index * step, *commands] for index, commands in enumerate(experiment.commands.tolist())]
         lines = [",".join(["time (s)", *_headers(experiment)]), *(",".join(f"{x:.6g}" for x in row) for row in rows)]
         write_text(Path(files) / COMMANDS, "\n".join(lines) + "\n")
         write_text(Path(files) / RESULT, json.dumps(to_json(experiment), indent=2, ensure_ascii=False) + "\n")
@@ -48,15 +47,19 @@ def _try_to_film(experiment: Experiment, path: Path) -> bool:
 
 
 def _headers(experiment: Experiment) -> list[str]:
-    units = experiment.command_units or ("",) * len(experiment.actuators)
-    return [f"{name} ({unit})" if unit else name for name, unit in zip(experiment.actuators, units, strict=True)]
+    named = zip(experiment.simulator.actuators, _units(experiment), strict=True)
+    return [f"{name} ({unit})" if unit else name for name, unit in named]
+
+
+def _units(experiment: Experiment) -> tuple[str, ...]:
+    return tuple(experiment.simulator.action_units) or ("",) * len(experiment.simulator.actuators)
 
 
 def to_json(experiment: Experiment) -> dict:
     """The expected verdict as plain data."""
     return {
         "seconds": experiment.seconds,
-        "control_step": experiment.control_step,
+        "control_step": experiment.simulator.control_step,
         "explanations": [list(words) for words in experiment.explanations],
         "told_apart": experiment.told_apart.round(4).tolist(),
         "shown": [asdict(one) for one in experiment.shown],
@@ -66,27 +69,24 @@ def to_json(experiment: Experiment) -> dict:
 
 def page(experiment: Experiment, film: str | None = None) -> str:
     """The page, with its plots embedded, and the film beside it, if there is one."""
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    times = np.arange(len(experiment.commands) + 1) * experiment.control_step
+    times = np.arange(len(experiment.commands) + 1) * experiment.simulator.control_step
     blocks = experiment.block_seconds * np.arange(len(experiment.nats) + 1)
     most = np.argsort(experiment.nats)[len(experiment.nats) - round(PARTING * len(experiment.nats)) :]
     marked = [(float(blocks[i]), float(blocks[i + 1])) for i in most if experiment.nats[i] > 0.0]
-    shown = [k for k, name in enumerate(experiment.readings) if not name.endswith("_velocity")] or [0]
+    readings = list(zip(experiment.simulator.state_map.names, experiment.simulator.state_map.units, strict=True))
     motions = [
-        plots.motions_in_time(times, experiment.motions[:, :, k], experiment.readings[k], experiment.units[k], marked)
-        for k in shown
+        plots.motions_in_time(times, experiment.motions[:, :, k], name, unit, marked)
+        for k, (name, unit) in enumerate(readings)
+        if not name.endswith("_velocity")
     ]
-    units = experiment.command_units or ("",) * len(experiment.actuators)
     commands = [
-        plots.motions_in_time(times[:-1], experiment.commands[None, :, k], name, units[k], ())
-        for k, name in enumerate(experiment.actuators)
+        plots.motions_in_time(times[:-1], experiment.commands[None, :, k], name, unit, ())
+        for k, (name, unit) in enumerate(zip(experiment.simulator.actuators, _units(experiment), strict=True))
     ]
-    return environment.get_template("experiment.html.jinja").render(
-        experiment=experiment, motions=motions, commands=commands, colours=plots.LINES, quantity=quantity, film=film
+    return (
+        templates(Path(__file__).parent)
+        .get_template("experiment.html.jinja")
+        .render(
+            experiment=experiment, motions=motions, commands=commands, colours=plots.LINES, quantity=quantity, film=film
+        )
     )

@@ -7,14 +7,13 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-import jinja2
-
 from torchrl_h2o.effects import is_negligible
 from torchrl_h2o.residuals.report import plots
 from torchrl_h2o.residuals.report.agreement import logged_values
 from torchrl_h2o.residuals.report.contents import FoundEffect, ReportContents
 from torchrl_h2o.residuals.report.mended_model import REMEDY
 from torchrl_h2o.residuals.report.sentence import sentences
+from torchrl_h2o.residuals.report.templates import templates
 from torchrl_h2o.residuals.report.windows import RunError
 from torchrl_h2o.residuals.report.words import (
     change,
@@ -57,13 +56,7 @@ def report_page(report: ReportContents) -> str:
     Returns:
         HTML with its style and pictures embedded, without references to other resources.
     """
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    environment = templates(Path(__file__).parent)
     environment.filters |= {"number": number, "quantity": quantity}
     return environment.get_template(_TEMPLATE).render(
         report=report,
