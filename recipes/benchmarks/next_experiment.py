@@ -25,7 +25,7 @@ from tqdm import tqdm
 import torchrl_h2o.quiet  # noqa: F401  (silences other packages)
 from torchrl_h2o.comparison.records import Record, read_records
 from torchrl_h2o.effects import Effect
-from torchrl_h2o.experiment import joined
+from torchrl_h2o.experiment import Envelope, joined
 from torchrl_h2o.experiment.design import Setting, best_commands
 from torchrl_h2o.experiment.excitation import candidate
 from torchrl_h2o.experiment.expected import told_apart
@@ -38,7 +38,7 @@ from torchrl_h2o.residuals.report.words import effect_words
 
 TABLE = "next_experiment"
 CASES, DRAWS = 40, 10  # cases, and draws of each, of which the first whose log leaves rivals is taken
-LIMITS = {"seconds": 5.0, "within": 0.6, "speed": 4.0, "band": 3.0}
+ENVELOPE = Envelope(seconds=5.0, within=0.6, speed=4.0, band=3.0)
 DESIGNED, RANDOM = ("designed", "D-optimal"), {"random": "steps", "chirp": "chirp", "multisine": "multisine"}
 
 
@@ -99,7 +99,7 @@ def run_case(number: int, seed: int, minutes: float, folder: Path) -> Record | N
         return None
     case, report = drawn
     simulation, first = case.simulation(), case.log(case.motion(case.first_commands()), 0)
-    setting = setting_of(simulation, first, report, np.random.default_rng(seed), **LIMITS)
+    setting = setting_of(simulation, first, report, ENVELOPE, np.random.default_rng(seed))
     values = {
         "number": number,
         "pair": case.pair,

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from torchrl_h2o.effects import Payload
-from torchrl_h2o.experiment import as_ted, joined, next_experiment
+from torchrl_h2o.experiment import Envelope, as_ted, joined, next_experiment
 from torchrl_h2o.residuals import Simulation, close_the_loop
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "outputs/tutorial_next")
@@ -64,7 +64,7 @@ report = close_the_loop(simulator, first, candidates)
 print(f"\nthe first log: {report.sentence()}\n")
 
 # %% The commands that tell apart what it leaves open, within 0.8 rad of the pose at rest.
-experiment = next_experiment(simulator, first, report, seconds=5.0, within=0.8, minutes=0.5)
+experiment = next_experiment(simulator, first, report, Envelope(seconds=5.0, within=0.8), minutes=0.5)
 experiment.save(folder)
 print(f"\n{experiment.words()}\n\ncommands: {folder / 'commands.csv'}, look at {folder / 'experiment.html'}\n")
 

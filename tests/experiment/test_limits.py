@@ -6,7 +6,7 @@ import pytest
 
 from tests.residuals.pendulum import double_pendulum
 from torchrl_h2o.effects import ActionDelay, ActionLag
-from torchrl_h2o.experiment.limits import Limits, state_at_rest
+from torchrl_h2o.experiment.limits import Envelope, Limits, state_at_rest
 from torchrl_h2o.experiment.separation import Motion
 from torchrl_h2o.residuals import Simulation, StateMap
 
@@ -33,13 +33,15 @@ def balls() -> Simulation:
 
 
 def test_limits_are_those_of_the_model_and_around_the_rest_and_of_the_log_without_any():
-    limits = Limits.around(balls(), np.zeros(4), np.array([[0.0, -0.4], [0.1, 0.6]]), within=5.0, speed=1.0)
+    limits = Limits.around(balls(), np.zeros(4), np.array([[0.0, -0.4], [0.1, 0.6]]), Envelope(within=5.0, speed=1.0))
     assert limits.command == pytest.approx(np.array([[-0.9, 2.9], [-0.4, 0.6]]))
     assert limits.position == pytest.approx(np.array([[-1.9, 1.9], [-5.0, 5.0]]))
 
 
 def test_a_run_keeps_the_limits_or_not():
-    limits = Limits.around(SIMULATION, np.zeros(4), np.array([[-1.0, -1.0], [1.0, 1.0]]), within=0.5, speed=2.0)
+    limits = Limits.around(
+        SIMULATION, np.zeros(4), np.array([[-1.0, -1.0], [1.0, 1.0]]), Envelope(within=0.5, speed=2.0)
+    )
     runs = np.zeros((4, 3, 4))
     runs[1, 1, 0], runs[2, 2, 3], runs[3, 1, 1] = 0.6, -2.1, np.nan
     assert limits.kept(runs).tolist() == [True, False, False, False]
@@ -49,7 +51,7 @@ def test_parts_may_not_touch_that_are_apart_at_rest():
     simulation, commands = balls(), np.array([[-1.0, -1.0], [1.0, 1.0]])
     apart, together = (np.array([[0.0, 0.0, 0.0, 0.0], [x, 0.0, 0.0, 0.0]]) for x in (0.1, 0.35))
     strict, free = (
-        Limits.around(simulation, np.zeros(4), commands, within=1.0, speed=9.0, contact=contact)
+        Limits.around(simulation, np.zeros(4), commands, Envelope(within=1.0, speed=9.0, contact=contact))
         for contact in (False, True)
     )
     assert [strict.touches(simulation, each) for each in (apart, together, together[1:])] == [False, True, False]
@@ -85,7 +87,7 @@ def test_late_servos_rest_where_they_are_held_and_stay_there(late, frame_skip):
 
 def test_targets_of_servos_stay_in_the_limits_of_their_joints_and_a_gripper_may_rest_at_its_stop():
     machine, rest, command = slide(SERVO, limits='range="0 0.04"'), np.zeros(2), np.zeros((1, 1))
-    around = Limits.around(machine, rest, command, within=0.5, speed=1.0)
+    around = Limits.around(machine, rest, command, Envelope(within=0.5, speed=1.0))
     assert around.position[0] == pytest.approx([0.0, 0.039])
     assert around.command[0] == pytest.approx([0.0, 0.039])
     assert around.kept(np.zeros((1, 5, 2))).all()
@@ -97,6 +99,6 @@ def test_a_free_base_has_no_limits_of_its_quaternion():
     state_map = StateMap.of_coordinates(names, ["m"] * 3, range(3), 13)
     limits = Limits.around(
         Simulation(lambda: mujoco.MjSpec.from_string(xml), 2, state_map),
-        np.zeros(13), np.zeros((1, 1)), within=0.1, speed=1.0,
+        np.zeros(13), np.zeros((1, 1)), Envelope(within=0.1, speed=1.0),
     )  # fmt: skip
     assert np.isinf(limits.position).all()

@@ -13,7 +13,7 @@ from torchrl_h2o.experiment import next_experiment
 from torchrl_h2o.experiment.design import Setting, best_commands
 from torchrl_h2o.experiment.excitation import candidate
 from torchrl_h2o.experiment.expected import as_ted, narrowed, told_apart
-from torchrl_h2o.experiment.limits import Limits
+from torchrl_h2o.experiment.limits import Envelope, Limits
 from torchrl_h2o.experiment.separation import Explained, Motion, Yardstick, nats_apart, predicted
 from torchrl_h2o.residuals import Report
 from torchrl_h2o.residuals.ground import Ground
@@ -43,7 +43,7 @@ def setting_of(measured, *sets, within=1.0):
     known = [known_set(catalogue, effects) for effects in sets]
     ground = Ground.of(SIMULATION, measured, known[0].effects)
     explanations = [Explained.of(ground, ground.found(one.entries, one.effects)) for one in known]
-    limits = Limits.around(SIMULATION, np.zeros(4), measured.action, within=within, speed=8.0)
+    limits = Limits.around(SIMULATION, np.zeros(4), measured.action, Envelope(within=within, speed=8.0))
     noise = 0.01 * measured.observation.std(0)
     return Setting(explanations, Yardstick.of(ground), limits, np.zeros(4), np.zeros(2), 200, 3.0, noise)
 
@@ -136,7 +136,7 @@ def report():
 
 def test_an_experiment_is_written_for_people_scripts_and_the_machine(report, log, tmp_path):
     experiment = next_experiment(
-        SIMULATION, log, report, seconds=2.0, within=1.0, speed=8.0, minutes=0.05, progress=False
+        SIMULATION, log, report, Envelope(seconds=2.0, within=1.0, speed=8.0), minutes=0.05, progress=False
     )
     experiment.save(tmp_path)
     commands = pd.read_csv(tmp_path / "commands.csv")

@@ -9,7 +9,7 @@ from tests.residuals.pendulum import double_pendulum
 from torchrl_h2o.experiment import plan_experiment
 from torchrl_h2o.experiment.design import Setting
 from torchrl_h2o.experiment.excitation import candidate
-from torchrl_h2o.experiment.limits import Limits
+from torchrl_h2o.experiment.limits import Envelope, Limits
 from torchrl_h2o.experiment.separation import Explained, Yardstick
 from torchrl_h2o.experiment.shown import further_effects, shown_effects, smallest_sizes
 from torchrl_h2o.likelihood import ENOUGH
@@ -22,7 +22,7 @@ KINDS = ("JointDamping", "JointFrictionLoss", "JointForce", "ActionBias", "Actio
 
 @pytest.fixture(scope="module")
 def setting():
-    limits = Limits.around(SIMULATION, np.zeros(4), np.zeros((1, 2)), within=1.0, speed=8.0)
+    limits = Limits.around(SIMULATION, np.zeros(4), np.zeros((1, 2)), Envelope(within=1.0, speed=8.0))
     unknown = [one for one in further_effects(FIRST) if type(one.effect).__name__ in KINDS]
     yard = Yardstick.of_encoders(SIMULATION, 1e-3)
     return Setting([FIRST], yard, limits, np.zeros(4), np.zeros(2), 300, 3.0, np.zeros(4), unknown=unknown)
@@ -70,7 +70,7 @@ def test_a_constant_torque_of_a_joint_looks_like_a_bias_of_its_motor(setting, kn
 
 
 def test_a_plan_says_what_it_would_show_and_writes_it(tmp_path):
-    plan = plan_experiment(SIMULATION, seconds=2.0, within=1.0, speed=8.0, minutes=0.05, progress=False)
+    plan = plan_experiment(SIMULATION, Envelope(seconds=2.0, within=1.0, speed=8.0), minutes=0.05, progress=False)
     plan.save(tmp_path)
     first, *others = plan.words().splitlines()
     assert first == "2 s of these commands would show, from known states and from this size on:"
@@ -88,7 +88,7 @@ def test_without_a_renderer_all_but_the_film_is_written(tmp_path, monkeypatch, c
         raise RuntimeError("no OpenGL")
 
     monkeypatch.setattr("torchrl_h2o.experiment.files.film_motion", fails)
-    plan_experiment(SIMULATION, seconds=2.0, speed=8.0, minutes=0.01, progress=False).save(tmp_path)
+    plan_experiment(SIMULATION, Envelope(seconds=2.0, speed=8.0), minutes=0.01, progress=False).save(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {"commands.csv", "experiment.html", "experiment.json"}
     assert "no preview.gif: no OpenGL" in capsys.readouterr().out
 

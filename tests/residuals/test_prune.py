@@ -36,32 +36,30 @@ def test_an_effect_on_several_joints_stays_on_all_or_on_none(true, found, left):
     assert all(isinstance(effect, JointFrictionLoss) for effect in pruned.effects)
 
 
+def after_replacing(found, true, kinds):
+    """The effects that take the place of those found, of some kinds, in data of a double pendulum."""
+    simulation = double_pendulum()
+    measured = recorded(simulation.with_effects(true), 2000, 0.002)
+    catalogue = [entry for entry in simulation.catalogue() if isinstance(entry.effect, kinds)]
+    start = known_set(catalogue, found)
+    ground = Ground.of(simulation, measured, start.effects)
+    fitted = ground.fitted(start.entries, start.effects)
+    directions = sweep(ground.rough(fitted.effects), catalogue, fitted.effects)
+    changed, _ = replaced(ground, fitted, directions, lambda: None)
+    return changed.effects
+
+
 def test_the_better_effect_takes_the_place_of_another_and_what_is_idle_then_goes():
     """A constant torque on a joint acts as an offset of its motor's commands, where their limits are not reached."""
-    simulation = double_pendulum()
-    measured = recorded(simulation.with_effects(ActionBias(0.05, (1,))), 2000, 0.002)
-    catalogue = [entry for entry in simulation.catalogue() if isinstance(entry.effect, KINDS)]
-    start = known_set(catalogue, (JointForce(0.05, "elbow"), Gravity(1.0001)))
-    ground = Ground.of(simulation, measured, start.effects)
-    found = ground.fitted(start.entries, start.effects)
-    directions = sweep(ground.rough(found.effects), catalogue, found.effects)
-    changed, _ = replaced(ground, found, directions, lambda: None)
-    (bias,) = changed.effects
+    (bias,) = after_replacing((JointForce(0.05, "elbow"), Gravity(1.0001)), ActionBias(0.05, (1,)), KINDS)
     assert isinstance(bias, ActionBias)
     assert bias.bias == pytest.approx(0.05, rel=0.05)
 
 
 def test_one_effect_takes_the_place_of_the_same_effect_on_two_motors():
     """Two weak motors hardly lift what a heavy link weighs."""
-    simulation = double_pendulum()
-    measured = recorded(simulation.with_effects(BodyMass(1.3, "lower")), 2000, 0.002)
-    catalogue = [entry for entry in simulation.catalogue() if isinstance(entry.effect, ActionGain | BodyMass)]
-    start = known_set(catalogue, (ActionGain(0.85, (0,)), ActionGain(0.8, (1,))))
-    ground = Ground.of(simulation, measured, start.effects)
-    found = ground.fitted(start.entries, start.effects)
-    directions = sweep(ground.rough(found.effects), catalogue, found.effects)
-    changed, _ = replaced(ground, found, directions, lambda: None)
-    (mass,) = changed.effects
+    motors = ActionGain(0.85, (0,)), ActionGain(0.8, (1,))
+    (mass,) = after_replacing(motors, BodyMass(1.3, "lower"), (ActionGain, BodyMass))
     assert isinstance(mass, BodyMass)
     assert mass.scale == pytest.approx(1.3, rel=0.05)
 

@@ -16,10 +16,9 @@ import shlex
 import sys
 import time
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import fields, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any
 
 import mujoco
 from hydra.core.hydra_config import HydraConfig
@@ -35,7 +34,7 @@ from torchrl_h2o.data import Audit, DataError, audit
 from torchrl_h2o.data.readers.observed import words_of_estimates
 from torchrl_h2o.effects import CatalogueEntry, paper_gap
 from torchrl_h2o.envs import DynamicsGap
-from torchrl_h2o.experiment import Experiment, next_experiment, plan_experiment
+from torchrl_h2o.experiment import Envelope, Experiment, next_experiment, plan_experiment
 from torchrl_h2o.experiment.files import COMMANDS, PAGE
 from torchrl_h2o.options import CloseTheLoopOptions
 from torchrl_h2o.residuals import Report, Simulation, close_the_loop
@@ -48,7 +47,7 @@ from torchrl_h2o.whole_file import whole_files
 DESIGN_MINUTES = 1.0  # of the CPU, to design an experiment, unless ``minutes`` is given
 PLANNED_STEP = 0.01  # s, control step of a first log, unless ``simulator.control_step`` is given
 DRIVEN = {int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)}
-OF_DESIGN = ("next", "seconds", "within", "speed", "band", "contact", "minutes", "data")
+OF_DESIGN = ("next", "minutes", "data", *(field.name for field in fields(Envelope)))
 FOR_FILES = 0.04  # share of ``minutes`` for writing the report and the mended model
 
 
@@ -144,8 +143,10 @@ def design(cfg: DictConfig, simulation: Simulation, recording: Recording, direct
     Raises:
         ValueError: if the report has no effects, the machine does not come to rest, or no commands keep the limits.
     """
+    report, minutes = Report.load(cfg.next), cfg.minutes or DESIGN_MINUTES
     write(
-        next_experiment(simulation, recording.transitions, Report.load(cfg.next), **options_of_design(cfg)), directory
+        next_experiment(simulation, recording.transitions, report, envelope_of(cfg), minutes=minutes, seed=cfg.seed),
+        directory,
     )
     given = [one for one in HydraConfig.get().overrides.task if one.partition("=")[0] not in OF_DESIGN]
     earlier = cfg.data if isinstance(cfg.data, str) else ",".join(cfg.data)
@@ -160,7 +161,8 @@ def plan(cfg: DictConfig, directory: Path) -> None:
             keep the limits.
     """
     simulation = Simulation.from_mjcf(cfg.plan, joints_of(cfg.plan), cfg.simulator.get("control_step") or PLANNED_STEP)
-    write(plan_experiment(simulation, noise=cfg.noise, **options_of_design(cfg)), directory)
+    minutes = cfg.minutes or DESIGN_MINUTES
+    write(plan_experiment(simulation, envelope_of(cfg), noise=cfg.noise, minutes=minutes, seed=cfg.seed), directory)
 
 
 def joints_of(path: str) -> list[str]:
@@ -172,10 +174,9 @@ def joints_of(path: str) -> list[str]:
     return [*names, *(f"{name}_velocity" for name in names)]
 
 
-def options_of_design(cfg: DictConfig) -> dict[str, Any]:
-    """The options that a next and a first experiment share."""
-    shared = {name: cfg[name] for name in ("seconds", "within", "speed", "band", "contact", "seed")}
-    return shared | {"minutes": cfg.minutes or DESIGN_MINUTES}
+def envelope_of(cfg: DictConfig) -> Envelope:
+    """What an experiment may use, by the options."""
+    return Envelope(**{field.name: cfg[field.name] for field in fields(Envelope)})
 
 
 def write(experiment: Experiment, directory: Path) -> None:

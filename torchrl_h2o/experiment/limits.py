@@ -17,6 +17,25 @@ SCALAR = [int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)]  #
 RANGE = 0.95  # share of a joint's range, and of an actuator's, that an experiment uses
 
 
+@dataclass(frozen=True)
+class Envelope:
+    """What an experiment may use. No data tell it: set what the machine, its mount and the people beside it allow.
+
+    Args:
+        seconds: duration, in s.
+        within: largest distance of a joint from its position at rest, in rad or m.
+        speed: largest velocity of a joint, in rad/s or m/s.
+        band: highest frequency of the commands, in Hz.
+        contact: whether parts may touch that do not touch at rest.
+    """
+
+    seconds: float = 5.0
+    within: float = 0.5
+    speed: float = 3.0
+    band: float = 3.0
+    contact: bool = False
+
+
 @dataclass(frozen=True, eq=False)
 class Limits:
     """Limits that every explanation must keep.
@@ -34,25 +53,14 @@ class Limits:
     contact: bool = False
 
     @classmethod
-    def around(
-        cls,
-        simulation: Simulation,
-        rest: np.ndarray,
-        commands: np.ndarray,
-        *,
-        within: float,
-        speed: float,
-        contact: bool = False,
-    ) -> Limits:
+    def around(cls, simulation: Simulation, rest: np.ndarray, commands: np.ndarray, envelope: Envelope) -> Limits:
         """Limits around a pose at rest: of the model, and of the commands of a log where the model has none.
 
         Args:
             simulation: the simulator.
             rest: state at rest, (nq + nv).
             commands: commands of an earlier log, (T, nu).
-            within: largest distance of a joint from its position at rest, in rad or m.
-            speed: largest velocity of a joint, in rad/s or m/s.
-            contact: whether parts may touch that do not touch at rest.
+            envelope: what the experiment may use.
         """
         model = simulation.model
         limited = model.actuator_ctrllimited.astype(bool)[:, None]
@@ -61,7 +69,7 @@ class Limits:
         position = np.full((model.nq, 2), [-np.inf, np.inf])
         for joint in np.flatnonzero(np.isin(model.jnt_type, SCALAR)):
             place = model.jnt_qposadr[joint]
-            position[place] = rest[place] + np.array([-within, within])
+            position[place] = rest[place] + np.array([-envelope.within, envelope.within])
             if model.jnt_limited[joint]:
                 low, high = _shrunk(model.jnt_range[joint])
                 low, high = min(low, rest[place]), max(high, rest[place])  # a gripper may rest at its stop
@@ -71,7 +79,7 @@ class Limits:
                 joint, gear = model.actuator_trnid[actuator, 0], model.actuator_gear[actuator, 0]
                 ends = np.sort(gear * position[model.jnt_qposadr[joint]])
                 command[actuator] = np.clip(command[actuator], *ends)
-        return cls(command, position, speed, contact)
+        return cls(command, position, envelope.speed, envelope.contact)
 
     def kept(self, states: np.ndarray) -> np.ndarray:
         """Whether each run, (B, T, nq + nv), keeps the limits of positions and velocities, (B)."""
@@ -83,7 +91,7 @@ class Limits:
 
     def touches(self, simulation: Simulation, states: np.ndarray) -> bool:
         """Whether parts touch in a run, (T, nq + nv), that do not touch in its first state."""
-        if self.contact:
+        if self.contact or not (simulation.model.geom_contype.any() or simulation.model.geom_conaffinity.any()):
             return False
         data, nq = mujoco.MjData(simulation.model), simulation.model.nq
         known: list[set[int]] = []

@@ -13,7 +13,7 @@ from tqdm import tqdm
 from torchrl_h2o.experiment.design import Setting, best_commands
 from torchrl_h2o.experiment.expected import told_apart
 from torchrl_h2o.experiment.experiment import Experiment, experiment_of
-from torchrl_h2o.experiment.limits import Limits, servos, state_at_rest
+from torchrl_h2o.experiment.limits import Envelope, Limits, servos, state_at_rest
 from torchrl_h2o.experiment.separation import Explained, Yardstick
 from torchrl_h2o.experiment.shown import further_effects
 from torchrl_h2o.residuals.estimated_states import sensor_noise
@@ -34,12 +34,8 @@ def next_experiment(
     simulator: EnvBase | Simulation,
     data: TensorDictBase,
     report: ReportContents,
+    envelope: Envelope = Envelope(),  # noqa: B008 (frozen)
     *,
-    seconds: float = 5.0,
-    within: float = 0.5,
-    speed: float = 3.0,
-    band: float = 3.0,
-    contact: bool = False,
     minutes: float = 1.0,
     seed: int = 0,
     progress: bool = True,
@@ -56,11 +52,7 @@ def next_experiment(
         simulator: the simulator that the report is about.
         data: the transitions that it was made from, (T,), in TED.
         report: the report.
-        seconds: duration of the experiment, in s.
-        within: largest distance of a joint from its position at rest, in rad or m.
-        speed: largest velocity of a joint, in rad/s or m/s.
-        band: highest frequency of the commands, in Hz.
-        contact: whether parts may touch that do not touch at rest.
+        envelope: what the experiment may use.
         minutes: time to search for commands, in minutes of the CPU.
         seed: seed of the candidates.
         progress: whether to show a progress bar.
@@ -73,9 +65,7 @@ def next_experiment(
         ValueError: if the report has no effects, the machine does not come to rest, or no commands keep the limits.
     """
     rng = np.random.default_rng(seed)
-    setting = setting_of(
-        simulator, data, report, rng, seconds=seconds, within=within, speed=speed, band=band, contact=contact
-    )
+    setting = setting_of(simulator, data, report, envelope, rng)
     with designing(progress) as show:
         knots = best_commands(setting, rng, 60.0 * minutes, show=lambda share: show(FOR_COMMANDS * share))
         apart = told_apart(
@@ -100,13 +90,8 @@ def setting_of(
     simulator: EnvBase | Simulation,
     data: TensorDictBase,
     report: ReportContents,
+    envelope: Envelope,
     rng: np.random.Generator,
-    *,
-    seconds: float,
-    within: float,
-    speed: float,
-    band: float,
-    contact: bool = False,
 ) -> Setting:
     """What an experiment is designed for; the arguments and errors are those of :func:`next_experiment`."""
     simulation = simulator if isinstance(simulator, Simulation) else Simulation.from_env(simulator)
@@ -119,11 +104,11 @@ def setting_of(
     return Setting(
         explanations=explanations,
         yard=Yardstick.of(ground),
-        limits=Limits.around(simulation, rest, measured.action, within=within, speed=speed, contact=contact),
+        limits=Limits.around(simulation, rest, measured.action, envelope),
         rest=rest,
         command=command,
-        steps=round(seconds / simulation.control_step),
-        band=band,
+        steps=round(envelope.seconds / simulation.control_step),
+        band=envelope.band,
         noise=np.zeros(len(simulation.state_map.names)) if noise is None else noise,
         unknown=further_effects(explanations[0]),
         guards=guards_of(simulation, report, int(rng.integers(2**31))),

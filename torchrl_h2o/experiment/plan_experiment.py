@@ -7,7 +7,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_h2o.experiment.design import Setting, best_commands
 from torchrl_h2o.experiment.experiment import Experiment, experiment_of
-from torchrl_h2o.experiment.limits import Limits, servos, state_at_rest
+from torchrl_h2o.experiment.limits import Envelope, Limits, servos, state_at_rest
 from torchrl_h2o.experiment.next_experiment import designing
 from torchrl_h2o.experiment.separation import Explained, Yardstick
 from torchrl_h2o.experiment.shown import further_effects
@@ -16,12 +16,8 @@ from torchrl_h2o.residuals.simulation.simulation import Simulation
 
 def plan_experiment(
     simulator: EnvBase | Simulation,
+    envelope: Envelope = Envelope(),  # noqa: B008 (frozen)
     *,
-    seconds: float = 5.0,
-    within: float = 0.5,
-    speed: float = 3.0,
-    band: float = 3.0,
-    contact: bool = False,
     noise: float = 1e-3,
     minutes: float = 1.0,
     seed: int = 0,
@@ -37,11 +33,7 @@ def plan_experiment(
 
     Args:
         simulator: the simulator, without a log.
-        seconds: duration of the experiment, in s.
-        within: largest distance of a joint from its position at rest, in rad or m.
-        speed: largest velocity of a joint, in rad/s or m/s.
-        band: highest frequency of the commands, in Hz.
-        contact: whether parts may touch that do not touch at rest.
+        envelope: what the experiment may use.
         noise: standard deviation of the noise of the encoders, in rad or m.
         minutes: time to search for commands, in minutes of the CPU.
         seed: seed of the candidates.
@@ -66,11 +58,11 @@ def plan_experiment(
     setting = Setting(
         explanations=[first],
         yard=Yardstick.of_encoders(simulation, noise),
-        limits=Limits.around(simulation, rest, command[None], within=within, speed=speed, contact=contact),
+        limits=Limits.around(simulation, rest, command[None], envelope),
         rest=rest,
         command=command,
-        steps=round(seconds / simulation.control_step),
-        band=band,
+        steps=round(envelope.seconds / simulation.control_step),
+        band=envelope.band,
         noise=np.zeros(len(simulation.state_map.names)),
         unknown=further_effects(first),
     )

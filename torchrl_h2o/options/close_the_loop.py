@@ -9,6 +9,7 @@ from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
 import torchrl_h2o.effects
 from torchrl_h2o.effects import Effect
+from torchrl_h2o.experiment.limits import Envelope
 from torchrl_h2o.options.nearest import did_you_mean
 from torchrl_h2o.options.run import MakeOptions
 from torchrl_h2o.options.sources import AnyPath, Data, Layout, NewFolder
@@ -87,9 +88,9 @@ class CloseTheLoopOptions(Options):
     )
     plan: AnyPath | None = option(None, "MJCF model: designs the first log, and says which effects it would show")
     noise: Positive = option(0.001, "noise of the encoders with plan: its standard deviation, rad or m")
-    seconds: Positive = option(5.0, "duration of the experiment of next or plan, s")
-    within: Positive = option(0.5, "largest distance of a joint from its position at rest in it, rad or m")
-    speed: Positive = option(3.0, "largest velocity of a joint in it, rad/s or m/s")
-    band: Positive = option(3.0, "highest frequency of its commands, Hz")
-    contact: bool = option(False, "whether parts may touch in it that do not touch at rest")
+    seconds: Positive = option(Envelope.seconds, "duration of the experiment of next or plan, s")
+    within: Positive = option(Envelope.within, "largest distance of a joint from its position at rest in it, rad or m")
+    speed: Positive = option(Envelope.speed, "largest velocity of a joint in it, rad/s or m/s")
+    band: Positive = option(Envelope.band, "highest frequency of its commands, Hz")
+    contact: bool = option(Envelope.contact, "whether parts may touch in it that do not touch at rest")
     seed: Seed = option(0)

@@ -8,7 +8,6 @@ import signal
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import cached_property, partial
 from multiprocessing.connection import Connection
 
@@ -21,6 +20,7 @@ from torchrl_h2o.training.returns import SEED, TRIAL_SEED, BestPolicy, Evaluatio
 from torchrl_h2o.training.task import Task
 
 Outcome = tuple[Evaluation, list[Evaluation]]  # in reality, and of each policy in the simulator
+Evaluate = Callable[[Sequence[torch.nn.Module]], Outcome]
 
 ENDS_WITHIN = 3.0  # s, after which a second process that still evaluates is ended
 
@@ -40,11 +40,10 @@ def evaluator_of(
         best: stores the policy that is the best in the simulator; None with ``keep=last``.
     """
     make_trials = partial(task.make_training_simulator, cfg.trial_episodes, preprocessing)
-    grounds = Grounds(
-        Episodes(partial(task.make_reality, cfg.eval_episodes, preprocessing), cfg.eval_episodes, SEED),
-        None if best is None else Episodes(make_trials, cfg.trial_episodes, TRIAL_SEED),
-    )
-    return Evaluator((SecondProcess if cfg.overlap else ThisProcess)(grounds), best)
+    reality = Episodes(partial(task.make_reality, cfg.eval_episodes, preprocessing), cfg.eval_episodes, SEED)
+    trials = None if best is None else Episodes(make_trials, cfg.trial_episodes, TRIAL_SEED)
+    process = SecondProcess if cfg.overlap else ThisProcess
+    return Evaluator(process(partial(evaluate_policies, reality, trials)), best)
 
 
 class Evaluator:
@@ -102,39 +101,27 @@ class Episodes:
         return evaluate(self._env, policy, self._episodes, self._seed)
 
 
-@dataclass(frozen=True)
-class Grounds:
-    """Where policies are evaluated.
-
-    Args:
-        reality: episodes in ``reality``.
-        simulator: episodes in the simulator; None for none.
-    """
-
-    reality: Episodes
-    simulator: Episodes | None
-
-    def evaluate(self, policies: Sequence[torch.nn.Module]) -> Outcome:
-        """Evaluates the last policy in ``reality``, and each one in the simulator."""
-        tried = [] if self.simulator is None else [self.simulator.run(policy) for policy in policies]
-        return self.reality.run(policies[-1]), tried
+def evaluate_policies(reality: Episodes, trials: Episodes | None, policies: Sequence[torch.nn.Module]) -> Outcome:
+    """Evaluates the last policy in ``reality``, and each one in the simulator if there are trials."""
+    tried = [] if trials is None else [trials.run(policy) for policy in policies]
+    return reality.run(policies[-1]), tried
 
 
 class ThisProcess:
     """Evaluates in this process, as soon as it gets policies.
 
     Args:
-        grounds: where.
+        evaluation: evaluates policies, such as :func:`evaluate_policies` with its episodes.
     """
 
     is_done = True
 
-    def __init__(self, grounds: Grounds) -> None:
-        self._grounds = grounds
+    def __init__(self, evaluation: Evaluate) -> None:
+        self._evaluation = evaluation
 
     def start(self, policies: Sequence[torch.nn.Module]) -> None:
-        """Begins to evaluate policies, see :meth:`Grounds.evaluate`."""
-        self._result = self._grounds.evaluate(policies)
+        """Begins to evaluate policies."""
+        self._result = self._evaluation(policies)
 
     def result(self) -> Outcome:
         """The evaluations of the last policies; waits for them."""
@@ -150,10 +137,10 @@ class SecondProcess:
     The second process ends when the pipe closes, also if this process is killed.
     """
 
-    def __init__(self, grounds: Grounds) -> None:
+    def __init__(self, evaluation: Evaluate) -> None:
         context = multiprocessing.get_context("spawn")  # a forked process would share locks of torch's threads
         self._pipe, theirs = context.Pipe()
-        arguments = (theirs, grounds, torch.get_num_threads())
+        arguments = (theirs, evaluation, torch.get_num_threads())
         self._process = context.Process(target=_evaluate_what_comes, args=arguments, daemon=True)
         self._process.start()
         theirs.close()
@@ -192,7 +179,7 @@ def _other_end() -> Iterator[None]:
         ) from None
 
 
-def _evaluate_what_comes(pipe: Connection, grounds: Grounds, threads: int) -> None:
+def _evaluate_what_comes(pipe: Connection, evaluation: Evaluate, threads: int) -> None:
     """Evaluates the policies that come through a pipe, until it is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to both processes; this one ends with the other
     torch.set_num_threads(threads)
@@ -202,7 +189,7 @@ def _evaluate_what_comes(pipe: Connection, grounds: Grounds, threads: int) -> No
         except (EOFError, OSError):  # OSError: the other end was closed before it had read the last result
             return
         try:
-            outcome = grounds.evaluate(policies)
+            outcome = evaluation(policies)
         except Exception as error:  # raised in the training's process
             outcome = _sendable(error)
         try:
