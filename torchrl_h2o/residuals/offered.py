@@ -12,6 +12,7 @@ from torchrl_h2o.data.audit.log import Log
 from torchrl_h2o.effects import CatalogueEntry, ObservationDelay
 from torchrl_h2o.residuals.explanation import Part
 from torchrl_h2o.residuals.intervals import interval
+from torchrl_h2o.residuals.measured.begun_anew import begun_anew
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
@@ -42,6 +43,7 @@ def late_velocities(simulation: Simulation, measured: Measured) -> tuple[Part | 
         The delay, None without one, and the data with these columns as ones that were estimated from others.
     """
     log, step = Log.of(measured, simulation), simulation.control_step
+    log = replace(log, clipped=log.clipped | begun_anew(log))
     late = [found for found in (fit_derivative(log, pair) for pair in log.pairs) if found.lag > LATE]
     if not late:
         return None, measured

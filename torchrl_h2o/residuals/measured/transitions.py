@@ -13,7 +13,9 @@ import torch
 from tensordict import TensorDictBase
 
 from torchrl_h2o.data import DataError
+from torchrl_h2o.data.audit.log import Log
 from torchrl_h2o.data.readers.ted import require_ted
+from torchrl_h2o.residuals.measured.begun_anew import BEGUN_ANEW, begun_anew
 from torchrl_h2o.residuals.measured.moving_rows import moving_rows
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
@@ -121,7 +123,9 @@ class Measured:
         _require_width(action, simulation.actuators, "action", source)
         ends = cast("torch.Tensor", data["next", "done"]).flatten().numpy()
         breaks = ends[:-1] | (following[:-1] != observation[1:]).any(1)
-        run = np.concatenate([[0], np.cumsum(breaks)])
+        anew = begun_anew(Log.of(data, simulation))
+        # such a row is a run of its own
+        run = np.concatenate([[0], np.cumsum(breaks | anew[:-1] | anew[1:])])
         clipped = simulation.state_map.clipped(observation) | simulation.state_map.clipped(following)
         logs = cast("torch.Tensor", data["log"]).flatten().numpy() if "log" in data.keys() else np.zeros(len(run), int)
         step = np.arange(len(run)) * simulation.control_step
@@ -139,6 +143,8 @@ class Measured:
             WINDOWS_IN_BLOCK if simulation.state_map.hidden else 1,
             logs,
         )
+        if anew.any():
+            measured = measured.without(anew, BEGUN_ANEW)
         if not simulation.state_map.hidden:
             return measured
         return measured.without(measured.run_beginnings(), "unobserved coordinates are not known yet")
