@@ -8,6 +8,7 @@ which reuses them. Writes a record of each file to outputs/benchmark/off_dynamic
 has recorded there.
 """
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +58,7 @@ def measure(file: str, folder: Path, to: Path) -> dict[str, Any]:
     cfg = run_options(f"env={env_of_file(file)}", f"data={folder / file}.hdf5", "mend=true")
     task = task_of(cfg)
     real = task.read_real_data(cfg.data)
+    shutil.rmtree(to / "reports" / file, ignore_errors=True)  # it may be an earlier commit's
     find_missing_effects(cfg, task, real, to / "reports" / file)
     report = report_of_run(to / "reports" / file)
     assert report is not None, "a search writes a report, also where it finds nothing"
