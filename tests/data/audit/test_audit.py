@@ -28,6 +28,7 @@ from tests.residuals.pendulum import double_pendulum, recorded
 from torchrl_h2o.data import Audit, DataError, Finding, audit
 from torchrl_h2o.data.audit.log import Log
 from torchrl_h2o.data.audit.response import Response
+from torchrl_h2o.data.audit.rows import check_rows
 from torchrl_h2o.data.readers.ted import to_ted
 from torchrl_h2o.effects import ActionDelay, ActionGain, Armature, BodyMass, Gravity, JointDamping, JointFrictionLoss
 from torchrl_h2o.residuals import Simulation, StateMap
@@ -166,6 +167,16 @@ def test_shuffled_rows(good, simulation):
     order = np.random.default_rng(0).permutation(len(good))
     words = severe(measured(rows_of(good)[np.append(order, 0)], good.action[order]), simulation, "rows")
     assert "were put into another order" in words
+
+
+def test_a_joint_that_rattles_between_near_ends_does_not_jump(good, simulation):
+    def rattles(rows):
+        rng = np.random.default_rng(0)
+        rows[:, 1], rows[:, 3] = rng.uniform(-0.01, 0.01, len(rows)), rng.uniform(-5.0, 5.0, len(rows))
+        return rows
+
+    found = check_rows(Log.of(changed(good, rattles), simulation), simulation)
+    assert not any("jump" in finding.words for finding in found)
 
 
 def test_shuffled_transitions(good, simulation):

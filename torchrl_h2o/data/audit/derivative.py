@@ -16,6 +16,7 @@ VELOCITY_LAGS = (-3, 24)  # rows by which a velocity may be early or late
 LAG_GAIN = 0.7  # share of the unexplained variance that a shifted velocity must leave at most
 SCALE_WARNING = (0.85, 1.18)  # factors between derivative and velocity that are unsuspicious
 SCALE_SEVERE = (0.6, 1.67)  # factors between which a wrong scale is only a warning
+FARTHEST = 2.0  # multiple of the distance at the largest measured velocity beyond which no joint moves in one step
 KNOWN_FACTOR = 0.15  # relative distance to a known factor, such as 57.3 deg/rad, at which it is named
 
 
@@ -123,6 +124,11 @@ def _lateness(log: Log, displacement: np.ndarray, integral: np.ndarray, good: np
         left, middle, right = found[best - 1 : best + 2]
         return float(lags[best] + 0.5 * (left - right) / min(left - 2.0 * middle + right, -1e-12))
     return float(lags[best])
+
+
+def farthest(log: Log, pair: Pair) -> float:
+    """Distance beyond which no joint moves in one step, by its largest measured velocity."""
+    return FARTHEST * log.dt * float(np.abs(log.observation[:, pair.velocity]).max())
 
 
 def roughness(log: Log, column: int) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchrl_h2o.data.audit.derivative import deviation, roughness, steps_of
+from torchrl_h2o.data.audit.derivative import deviation, farthest, roughness, steps_of
 from torchrl_h2o.data.audit.finding import Finding, Rows
 from torchrl_h2o.data.audit.log import AuditedSimulation, Log, Pair
 from torchrl_h2o.data.audit.orientation import turning_rates
@@ -170,7 +170,7 @@ def _surprising(log: Log, simulation: AuditedSimulation, rows: np.ndarray) -> np
         error = log.following[rows, pair.position] - reached[:, pair.position]
         if pair.angle:
             error = error - 2.0 * np.pi * np.round(error / (2.0 * np.pi))
-        limit = JUMP * position_spread(log, pair)
+        limit = max(JUMP * position_spread(log, pair), farthest(log, pair))
         surprising |= ~(np.abs(error) <= limit) & (np.abs(_deviations(log, pair)[rows]) > limit)
     return surprising
 

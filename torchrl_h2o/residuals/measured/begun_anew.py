@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchrl_h2o.data.audit.derivative import roughness
+from torchrl_h2o.data.audit.derivative import farthest, roughness
 from torchrl_h2o.data.audit.log import Log
 
 BEGUN_ANEW = "a run begins anew"  # reason for excluded rows
-FARTHEST = 2.0  # multiple of the distance at the largest measured velocity beyond which no joint moves in one step
 NOISE = 10.0  # deviations of a position's noise that it may move besides
 RARE = 0.01  # share of the rows beyond which positions and velocities do not belong together, which the audit reports
 
@@ -22,7 +21,6 @@ def begun_anew(log: Log) -> np.ndarray:
     found = np.zeros(len(log), bool)
     for pair in log.pairs:
         moved = np.abs(log.following[:, pair.position] - log.observation[:, pair.position])
-        speed = np.abs(log.observation[:, pair.velocity]).max()
-        found |= moved > FARTHEST * speed * log.dt + NOISE * roughness(log, pair.position)
+        found |= moved > farthest(log, pair) + NOISE * roughness(log, pair.position)
     found &= ~log.clipped
     return found if found.mean() <= RARE else np.zeros(len(log), bool)
