@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+import numpy as np
 from cells import NOT_RUN, Runs, machines, share
 from search_tables import (
     audit_table,
@@ -54,7 +55,7 @@ def overview_table(runs: Runs) -> str:
             "rounds between simulator and reality",
             f"{len(runs['sim_to_real'])} runs" if "sim_to_real" in runs else NOT_RUN,
         ],
-        ["off_dynamics", "a benchmark of others", _mended_right(runs)],
+        ["off_dynamics", "a benchmark of others", _mended_exactly(runs)],
     ]
     return markdown_table(
         ["page", "what is in it", "now"], [[f"[{page}.md]({page}.md)", *rest] for page, *rest in rows]
@@ -68,11 +69,12 @@ def _covered(runs: Runs) -> str:
     return f"{share(told['truths_inside'].sum(), told['truths'].sum())} true values inside"
 
 
-def _mended_right(runs: Runs) -> str:
+def _mended_exactly(runs: Runs) -> str:
     if "off_dynamics" not in runs:
         return NOT_RUN
-    told = runs["off_dynamics"]
-    return f"{told['recommended'].sum()} of {len(told)} simulators mended, {len(OFF_DYNAMICS_FILES)} files"
+    told = runs["off_dynamics"].to_dict("records")
+    exact = sum(all(np.less_equal(run["mended"], run["changed"])) for run in told)  # errors one step ahead
+    return f"{exact} of {len(told)} simulators mended exactly, {len(OFF_DYNAMICS_FILES)} files"
 
 
 TABLES: dict[str, Callable[[Runs], str]] = {

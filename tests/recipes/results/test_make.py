@@ -165,8 +165,12 @@ def test_the_files_of_a_benchmark_of_others_stand_with_what_was_found_and_what_i
     told = {"file": "walker2d_gravity_0.5_expert", "change": "gravity × 0.5", "found": "gravity × 0.49"}
     told |= {"verdict": "explained_in_part", "recommended": True, "unmodified": far, "mended": near, "changed": near}
     told |= {"reward_error": 0.002, "other_terminations": 2}
-    other = told | {"file": "walker2d_morph_medium", "found": "body mass × 2", "recommended": False}
-    saved(folder, *(Record("off_dynamics", one["file"], MADE_BY, one) for one in (told, other)))
+    other = told | {"file": "walker2d_morph_medium", "found": "body mass × 2", "recommended": False, "mended": far}
+    worse = told | {
+        "file": "walker2d_kinematic_expert",
+        "mended": [*near[:-1], 0.002],
+    }  # recommended, but one velocity is off
+    saved(folder, *(Record("off_dynamics", one["file"], MADE_BY, one) for one in (told, other, worse)))
     make.make(folder)
     page = (folder / "page.md").read_text()
     assert "| walker2d_gravity_0.5_expert | gravity × 0.5 | gravity × 0.49 | explained in part |  |" in page
@@ -174,4 +178,4 @@ def test_the_files_of_a_benchmark_of_others_stand_with_what_was_found_and_what_i
     assert "| walker2d_gravity_0.5_expert | 0.25 | 0.001 | 0.001 | 0.25 | 0.001 | 0.001 | 0.002 | 2 |" in page
     assert "Searches of commit abc1234." in page
     assert "beats the best" not in page  # there are no scores
-    assert "1 of 2 simulators mended" in make.tables_of(list(read_records(folder / "runs")))["overview"]
+    assert "1 of 3 simulators mended exactly" in make.tables_of(list(read_records(folder / "runs")))["overview"]
