@@ -166,10 +166,8 @@ def test_the_files_of_a_benchmark_of_others_stand_with_what_was_found_and_what_i
     told |= {"verdict": "explained_in_part", "recommended": True, "unmodified": far, "mended": near, "changed": near}
     told |= {"reward_error": 0.002, "other_terminations": 2}
     other = told | {"file": "walker2d_morph_medium", "found": "body mass × 2", "recommended": False, "mended": far}
-    worse = told | {
-        "file": "walker2d_kinematic_expert",
-        "mended": [*near[:-1], 0.002],
-    }  # recommended, but one velocity is off
+    one_velocity_off = [*near[:-1], 0.002]
+    worse = told | {"file": "walker2d_kinematic_expert", "mended": one_velocity_off}  # recommended all the same
     saved(folder, *(Record("off_dynamics", one["file"], MADE_BY, one) for one in (told, other, worse)))
     make.make(folder)
     page = (folder / "page.md").read_text()
